@@ -184,6 +184,12 @@ class Outputs:
                 file=final,
                 remedy="remove or rename it",
             )
+        if os.path.exists(final) and not os.path.isfile(final):
+            raise InputError(
+                "this is a device, a pipe or a socket; outputs do not replace it",
+                file=final,
+                remedy="choose another path",
+            )
         try:
             if len(os.fsencode(final.name)) > os.pathconf(final.parent, "PC_NAME_MAX"):
                 raise InputError("this name is too long for the file system", file=final, remedy="rename the image")

@@ -116,6 +116,16 @@ def test_side_cars_of_drivers_go_and_files_of_others_stay(tmp_path: Path) -> Non
     assert contents(tmp_path) == {"a.tif": "a", "b.tif": "b", ".other.part": "other"}
 
 
+def test_a_device_or_pipe_is_not_replaced(tmp_path: Path) -> None:
+    """As root `-o /dev/null` or `-o /dev/full` left a plain file in the place of the device."""
+    pipe = tmp_path / "ortho.tif"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match="a device, a pipe or a socket"):
+        write_text(pipe, "content")
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
 def test_nothing_is_written_outside_of_the_folder_that_confines(tmp_path: Path) -> None:
     inside, link = tmp_path / "in", tmp_path / "link"
     inside.mkdir()
