@@ -6,6 +6,7 @@ module, and what installed packages declare of the commands that they add.
 
 from __future__ import annotations
 
+import errno
 import functools
 import importlib
 import logging
@@ -194,7 +195,15 @@ def _print_usage_error(words: Container[str], error: click.UsageError) -> None:
 
 
 def _fault(error: BaseException) -> OrthoError:
-    """Return an unexpected error as one that users can report."""
+    """Return an unexpected error as one that users can report, or correct if a disk is full."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        full = OrthoError(
+            f"cannot write ({error.strerror})",
+            file=error.filename,
+            remedy="free some space on the disk that receives the outputs or the printed text, and run it again",
+        )
+        full.__cause__ = error
+        return full
     fault = OrthoError(
         f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
         remedy="this is a bug in ortho-pipeline; run the command again with --debug and report the traceback",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
 import pkgutil
@@ -342,3 +343,13 @@ def test_usage_errors_are_documents_too(words, field):
     assert document["error"]["field"] == field
     assert document["error"]["remedy"]
     assert document["error"]["message"] in done.stderr
+
+
+def test_a_full_disk_that_receives_what_is_printed_is_no_bug(monkeypatch):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("ortho_pipeline.cli.machine.installed.say", full)
+    done = CliRunner().invoke(cli, ["sensors"])
+    assert done.exit_code == 1
+    assert "cannot write (No space left on device)\n  Remedy: free some space" in done.output
