@@ -24,6 +24,9 @@ INVERSE_TOLERANCE = 1e-9
 #: A point is NaN if its projection differs from the image point by more than this (px).
 INVERSE_VERIFIED = 1e-5
 _INVERSE_STEPS = 25
+#: A step of a parameter moves the image by this much (px), which is more than rounding errors and less than a curve.
+_MOVED = 0.01, 10.0
+_STEP_TRIES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,18 +197,27 @@ class SensorModel(ABC):
         return partials
 
     def param_partials(self, ground: ArrayLike) -> Array:
-        """Return d(image)/d(params) as ``(N, 2, P)``, by central differences."""
+        """Return d(image)/d(params) as ``(N, 2, P)``, by central differences over 0.01 to 10 px if possible."""
         ground = as_ground(ground)
         params = self.params
         partials = np.empty((len(ground), 2, len(params)))
         for k, value in enumerate(params):
             step = 1e-6 * max(abs(value), 1e-3)
-            ahead, behind = params.copy(), params.copy()
-            ahead[k] += step
-            behind[k] -= step
-            partials[:, :, k] = (
-                self.with_params(ahead).ground_to_image(ground) - self.with_params(behind).ground_to_image(ground)
-            ) / (ahead[k] - behind[k])
+            for _ in range(_STEP_TRIES):
+                ahead, behind = params.copy(), params.copy()
+                ahead[k] += step
+                behind[k] -= step
+                after, before = (self.with_params(values).ground_to_image(ground) for values in (ahead, behind))
+                moved = after - before
+                reach = np.nanmax(np.abs(moved), initial=0.0)
+                # A step of 1e-9 suits an angle in radians. A position in metres has rounding errors of that size.
+                if reach < _MOVED[0] and step < 0.01 * max(abs(value), 1.0):
+                    step *= 100
+                elif reach > _MOVED[1]:
+                    step /= 100
+                else:
+                    break
+            partials[:, :, k] = moved / (ahead[k] - behind[k])
         return partials
 
     def projected(self, ground: ArrayLike) -> tuple[Array, Array]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.models import RPC, ImageCorrection, SensorModel, model_from_dict, rational, rpc_kernel
+from ortho_pipeline.models import KINDS, RPC, ImageCorrection, SensorModel, model_from_dict, rational, rpc_kernel
 from ortho_pipeline.models.rational import COMPILED_FROM
 from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.testing import check_sensor_model
@@ -248,3 +250,36 @@ def test_models_survive_json_without_loss():
 def test_bad_model_data_is_an_input_error(data):
     with pytest.raises(InputError):
         model_from_dict(data)
+
+
+@dataclass(frozen=True, eq=False)
+class Shifted(SensorModel):
+    """A map of 10 m pixels that adds its shift (m) to geocentric coordinates, which have rounding errors of 1e-9 m."""
+
+    kind: ClassVar[str] = "test-shifted"
+    crs: ClassVar[str] = "EPSG:32636"
+    domain: ClassVar = np.array([350e3, 4120e3, 500.0]), np.array([5e3, 5e3, 500.0])
+    param_names: ClassVar[tuple[str, ...]] = ("east", "north")
+    shift: tuple[float, ...] = (0.0, 0.0)
+
+    @property
+    def params(self):
+        return np.array(self.shift)
+
+    def with_params(self, params):
+        return self._replace(shift=tuple(params))
+
+    def ground_to_image(self, ground):
+        far = np.array([6378137.0, -6378137.0])
+        ground = np.asarray(ground, dtype=float)
+        return (ground[:, :2] + far + self.shift - far - self.domain[0][:2]) / 10 + 0 * ground.sum(axis=1)[:, None]
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-6, 30.0, 1e7])
+def test_slopes_of_parameters_are_right_in_any_unit_and_at_zero(value, monkeypatch):
+    model = Shifted((value, value))
+    ground = box_of(model, 20)
+    np.testing.assert_allclose(model.param_partials(ground), np.broadcast_to(np.eye(2) / 10, (20, 2, 2)), atol=1e-8)
+    assert model.param_partials(ground[:0]).shape == (0, 2, 2)
+    monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
+    check_sensor_model(Shifted(), ground)
