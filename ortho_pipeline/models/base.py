@@ -383,10 +383,16 @@ def ground_of_grid(model: SensorModel, size: tuple[int, int], count: int, height
 
 
 def box_around(ground: Array, heights: tuple[float, float]) -> tuple[Array, Array]:
-    """Return centre and half-size ``(3,)`` of the box around ground points, between two heights."""
+    """Return centre and half-size ``(3,)`` of the box around ground points, between two heights.
+
+    They are read-only, because models keep them.
+    """
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     low[2], high[2] = heights
-    return (low + high) / 2, (high - low) / 2
+    centre, half = (low + high) / 2, (high - low) / 2
+    for values in (centre, half):
+        values.setflags(write=False)
+    return centre, half
 
 
 def ground_of_corners(model: SensorModel, size: tuple[int, int], heights: tuple[float, float]) -> Array:

@@ -83,6 +83,13 @@ def test_contract(tilt, heading, refraction):
     check_sensor_model(camera, ground)
 
 
+def test_nobody_changes_a_camera_through_its_domain():
+    camera = satellite(8, 192, DISTORTED)
+    for values in camera.domain:
+        with pytest.raises(ValueError, match="read-only"):
+            values[:] *= 1.5
+
+
 @pytest.mark.parametrize("refraction", [False, True])
 def test_contract_in_a_map_projection(refraction):
     camera = FrameCamera.from_map(

@@ -218,6 +218,15 @@ def test_copies_in_other_processes_project_alike() -> None:
     assert (pickle.loads(pickle.dumps(model)).ground_to_image(ground) == image).all()
 
 
+def test_nobody_changes_a_model_through_its_domain() -> None:
+    model = exact(scanner(size=200))
+    centre, half = model.domain
+    for values in (centre, half):
+        with pytest.raises(ValueError, match="read-only"):
+            values[:] *= 1.5
+    np.testing.assert_array_equal(model.domain, exact(scanner(size=200)).domain)
+
+
 def test_few_parameters_of_many_cost_little() -> None:
     """Partials by the six free parameters of a table with hundreds, which once cost as much as by all of them.
 
