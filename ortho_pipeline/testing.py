@@ -15,6 +15,7 @@ import json
 import pickle
 import tempfile
 from collections.abc import Iterator
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import described
 from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.hookspecs import Scene, Sensor
 from ortho_pipeline.host.contract import model_faults, scene_faults, sensor_faults
 from ortho_pipeline.models import KINDS, SensorModel, model_from_dict
@@ -44,7 +47,8 @@ def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
 
     It checks: shapes; N points give the same as N single points; rows of NaN stay NaN and do not change others; distant
     points raise nothing; image to ground and back closes; `ground_partials` and `param_partials` agree with finite
-    differences; `with_params` and `to_dict` restore the same model; pickling works.
+    differences; `with_params` and `to_dict` restore the same model and its domain; pickling works; heights
+    of `crs` are ellipsoidal; `corners` are near `domain`.
 
     Parameters
     ----------
@@ -65,6 +69,7 @@ def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
     _check_closure(model, points, image)
     _check_ground_partials(model, points)
     _check_params(model, points, image)
+    _check_statements(model, points, image)
     _check_copies(model, points, image)
 
 
@@ -169,6 +174,33 @@ def _points_in(model: SensorModel) -> NDArray[np.float64]:
     return centre + signs * half
 
 
+def _check_statements(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
+    """Check what a model states about itself, and that it stays the same model for its own range of heights."""
+    crs = parse_crs(model.crs)
+    declared = declared_vertical(crs)
+    assert declared is None or (declared.vertical is not None and declared.vertical.is_ellipsoid), (
+        f"crs {model.crs!r} has heights above a geoid, but ground_to_image always gets ellipsoidal heights; return the "
+        "horizontal CRS, and convert heights in the model"
+    )
+    centre, half = model.domain
+    corners = np.asarray(model.corners)
+    assert corners.shape[1:] == (3,), f"corners must be ground points (N, 3), not {corners.shape}"
+    beside = corners - centre
+    if crs.is_geographic:
+        beside[:, 0] -= 360 * np.round(beside[:, 0] / 360)
+    apart = np.abs(beside / half)
+    assert not (apart > 2).any(), f"corners are {np.nanmax(apart):.0f} half-sizes of the domain away from its centre"
+    low, high = model.height_range
+    least, most = model.height_limits
+    assert least <= low < high <= most, f"height_limits ({least:g}, {most:g}) must contain height_range"
+    assert model.detail > 0, f"detail must be a positive number of pixels, not {model.detail!r}"
+    accuracy = model.stated_accuracy
+    assert accuracy is None or (isinstance(accuracy, Real) and 0 <= float(accuracy) < np.inf), (
+        f"stated_accuracy must be None or a number of metres, not {accuracy!r}"
+    )
+    _check_copy(model.with_heights(low, high), model, ground, image, "with_heights")
+
+
 def _check_mapping(model: SensorModel, ground: NDArray[np.float64]) -> NDArray[np.float64]:
     image = model.ground_to_image(ground)
     n = len(ground)
@@ -218,7 +250,9 @@ def _check_far(model: SensorModel) -> None:
 
 
 def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
-    back = model.image_to_ground(image, ground[:, 2])
+    given = image.copy()
+    back = model.image_to_ground(given, ground[:, 2])
+    assert np.array_equal(given, image), "image_to_ground changes its argument"
     assert back.shape == ground.shape, f"image_to_ground must return {ground.shape}, not {back.shape}"
     assert np.isfinite(back).all(), (
         f"{counted(np.isnan(back).any(axis=1).sum(), 'point has', 'points have')} no inverse"
@@ -226,6 +260,10 @@ def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArr
     assert np.array_equal(back[:, 2], ground[:, 2]), "image_to_ground must return the given heights"
     worst = np.abs(model.ground_to_image(back) - image).max()
     assert worst < CLOSURE, f"image to ground and back differs by {worst:g} px; at most {CLOSURE:g} px are allowed"
+    level = model.image_to_ground(image, float(ground[0, 2]))
+    assert np.array_equal(level, model.image_to_ground(image, np.full(len(image), ground[0, 2])), equal_nan=True), (
+        "image_to_ground with one height must be the same as with that height for each point"
+    )
     # A second solution for the same image point would also close.
     apart = np.abs((back - ground) / model.domain[1]).max()
     assert apart < 1e-6, f"image_to_ground returned another point, {apart:g} half-sizes of the domain away"
@@ -259,6 +297,7 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
     same = model.with_params(params)
     assert np.array_equal(same.params, params), "with_params(params) does not give the parameters back"
     assert np.allclose(same.ground_to_image(ground), image, rtol=0, atol=1e-9), "with_params(params) is another model"
+    _check_box(same, model, "with_params")
     partials = model.param_partials(ground)
     assert partials.shape == (len(ground), 2, n), f"param_partials must return (N, 2, {n}), not {partials.shape}"
     shared = model.linearised(ground)
@@ -329,3 +368,10 @@ def _check_copy(
 ) -> None:
     assert type(copy) is type(model), f"{how} returns a {type(copy).__name__}"
     assert np.array_equal(copy.ground_to_image(ground), image), f"{how} returns another model"
+    _check_box(copy, model, how)
+    assert np.array_equal(copy.params, model.params), f"{how} returns a model with other parameters"
+
+
+def _check_box(copy: SensorModel, model: SensorModel, how: str) -> None:
+    assert copy.crs == model.crs, f"{how} returns a model with the crs {copy.crs!r}, not {model.crs!r}"
+    assert np.allclose(copy.domain, model.domain, rtol=1e-9, atol=0), f"{how} returns a model with another domain"

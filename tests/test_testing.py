@@ -148,6 +148,58 @@ def test_broken_models_are_found(monkeypatch, method, wrong, message):
         check_sensor_model(broken(), GROUND)
 
 
+def other_box(model, *args):
+    return Boxed(half=0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Boxed(Plane):
+    """A plane whose domain is a field."""
+
+    kind: ClassVar[str] = "test-boxed"
+    half: float = 1.0
+
+    @property
+    def domain(self):
+        return np.zeros(3), np.full(3, self.half)
+
+
+def height_of_one(model, image, height):
+    return SensorModel.image_to_ground(model, image, height if np.ndim(height) else height + 0.01)
+
+
+def changes_its_argument(model, image, height):
+    back = SensorModel.image_to_ground(model, image, height)
+    image[:] = 0.0
+    return back
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"with_params": other_box}, "with_params returns a model with another domain"),
+        ({"from_dict": classmethod(other_box)}, "to_dict returns a model with another domain"),
+        ({"with_heights": other_box}, "with_heights returns a model with another domain"),
+        ({"with_heights": lambda model, low, high: None}, "with_heights returns a NoneType"),
+        ({"crs": "EPSG:4326+5773"}, "has heights above a geoid"),
+        ({"image_to_ground": height_of_one}, "the same as with that height for each point"),
+        ({"image_to_ground": changes_its_argument}, "image_to_ground changes its argument"),
+        ({"corners": np.array([[0.0, 0.0], [100.0, 100.0]])}, r"corners must be ground points \(N, 3\)"),
+        ({"corners": np.array([[100.0, 100.0, 0.0]])}, "corners are 100 half-sizes"),
+        ({"height_limits": (0.0, 1.0)}, "height_limits .* must contain height_range"),
+        ({"detail": 0.0}, "detail must be a positive number"),
+        ({"stated_accuracy": "3 m"}, "stated_accuracy must be None or a number"),
+    ],
+)
+def test_what_a_model_states_besides_its_map_is_checked(monkeypatch, changes, message):
+    monkeypatch.setitem(KINDS, Boxed.kind, Boxed)
+    check_sensor_model(Boxed(), GROUND)
+    for name, value in changes.items():
+        monkeypatch.setattr(Boxed, name, value)
+    with pytest.raises(AssertionError, match=message):
+        check_sensor_model(Boxed(), GROUND)
+
+
 @dataclass(frozen=True, eq=False)
 class Stretched(Plane):
     """A plane with another scale in y, whose parameters come in the wrong order."""
