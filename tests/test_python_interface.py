@@ -357,3 +357,27 @@ def test_a_correction_needs_a_value_for_each_parameter(sample: Path) -> None:
 def test_the_output_of_some_commands_is_a_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no heights given"):
         match(tmp_path / "scene.tif", tmp_path / "m.geojson", op.MatchOptions(reference=("reference.tif",)))
+
+
+def test_what_a_masked_array_hides_is_nan(sample: Path) -> None:
+    model = op.open_scene(sample / "scene.tif").model
+    ground = np.ma.masked_array([[33.35, 37.25, 900.0], [33.35, 37.25, 900.0]], mask=[[0, 0, 1], [0, 0, 0]])
+    image = model.ground_to_image(ground)
+    assert np.isnan(image[0]).all()
+    np.testing.assert_array_equal(image[1:], model.ground_to_image([[33.35, 37.25, 900.0]]))
+    heights = np.ma.masked_array([900, 900], mask=[True, False], dtype=np.int16)
+    np.testing.assert_array_equal(
+        np.isnan(model.image_to_ground([[500, 500], [500, 500]], heights)[:, 2]), [True, False]
+    )
+    points = op.Points.of(np.ma.masked_less([[500, 500], [-9, -9]], 0), ground, "EPSG:4979")
+    assert np.isnan(points.image[1]).all()
+    assert np.isnan(points.ground[0, 2])
+
+
+@pytest.mark.parametrize("height", [[1.0, 2.0, 3.0], [[1.0], [2.0]], ["high", "low"]])
+def test_heights_of_another_number_are_refused_by_name(height, sample: Path) -> None:
+    model = op.open_scene(sample / "scene.tif").model
+    with pytest.raises(InputError, match="height"):
+        model.image_to_ground([[500.0, 500.0], [501.0, 500.0]], height)
+    with pytest.raises(InputError, match="ground is no array of numbers"):
+        model.ground_to_image([[33.0, 37.0, 800.0], [33.0, 37.0]])

@@ -245,7 +245,7 @@ class SensorModel(ABC):
         reach = 1.5 * (1 - 1e-12) * half[:2]
         ground = np.empty((len(image), 3))
         ground[:, :2] = centre[:2]
-        ground[:, 2] = height
+        ground[:, 2] = as_heights(height, len(image))
         left = np.flatnonzero(np.isfinite(image).all(axis=1) & np.isfinite(ground[:, 2]))
         for _ in range(_INVERSE_STEPS):
             if not len(left):
@@ -346,10 +346,28 @@ def as_image(image: ArrayLike) -> Array:
 
 
 def _as_points(points: ArrayLike, columns: int, what: str) -> Array:
-    array = np.ascontiguousarray(points, dtype=np.float64)
+    array = as_numbers(points, what)
     if array.ndim != 2 or array.shape[1] != columns:
         raise InputError(f"{what} points must have the shape (N, {columns}), not {array.shape}")
     return array
+
+
+def as_heights(heights: ArrayLike, count: int) -> Array:
+    """Return heights as ``(N,)`` float64: one for each point, or one for all."""
+    array = as_numbers(heights, "height")
+    if array.shape not in ((), (1,), (count,)):
+        raise InputError(f"height must be one number or have the shape ({count},), not {array.shape}")
+    return np.broadcast_to(array, (count,))
+
+
+def as_numbers(values: ArrayLike, what: str) -> Array:
+    """Return values as contiguous float64; NaN where a masked array has none."""
+    if isinstance(values, np.ma.MaskedArray):
+        values = values.astype(np.float64).filled(np.nan)
+    try:
+        return np.asarray(values, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} is no array of numbers ({error})", field=what) from error
 
 
 def as_params(params: ArrayLike, names: Sequence[str]) -> Array:

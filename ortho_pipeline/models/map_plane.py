@@ -26,7 +26,16 @@ from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
-from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image, as_params, box_around, ground_of_corners
+from ortho_pipeline.models.base import (
+    Array,
+    SensorModel,
+    as_ground,
+    as_heights,
+    as_image,
+    as_params,
+    box_around,
+    ground_of_corners,
+)
 
 PARAMETERS = ("shift_x", "shift_y", "relief_x", "relief_y")
 #: Length (m) over which a direction on the ellipsoid is converted to the map.
@@ -181,7 +190,7 @@ class MapPlane(SensorModel):
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         image = as_image(image)
         ground = np.empty((len(image), 3))
-        ground[:, 2] = height
+        ground[:, 2] = as_heights(height, len(image))
         ground[:, :2] = self._map_of(image) - np.outer(ground[:, 2] - self.plane, self.relief) - self.shift
         ground[~(np.isfinite(image).all(axis=1) & np.isfinite(ground[:, 2]))] = np.nan
         return ground

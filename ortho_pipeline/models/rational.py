@@ -33,6 +33,7 @@ from ortho_pipeline.models.base import (
     Array,
     SensorModel,
     as_ground,
+    as_heights,
     as_image,
     as_params,
 )
@@ -193,7 +194,7 @@ class RPC(SensorModel):
         if len(image) < COMPILED_FROM:
             return super().image_to_ground(image, height)
         ground = np.empty((len(image), 3))
-        heights = np.ascontiguousarray(np.broadcast_to(np.asarray(height, dtype=np.float64), len(image)))
+        heights = np.ascontiguousarray(as_heights(height, len(image)))
         rpc_kernel.image_to_ground(image, heights, *self.tables, INVERSE_TOLERANCE, INVERSE_VERIFIED, 25, ground)
         return ground
 

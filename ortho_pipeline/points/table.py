@@ -281,7 +281,8 @@ class Points:
 
 
 def _numbers(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
-    """Return a copy of the values as numbers, repeated to a shape."""
+    """Return a copy of the values as numbers, repeated to a shape; NaN where a masked array has none."""
+    values = values.astype(float).filled(np.nan) if isinstance(values, np.ma.MaskedArray) else values
     try:
         numbers = np.array(values, dtype=float)
         return numbers if shape is None else np.broadcast_to(numbers, shape)

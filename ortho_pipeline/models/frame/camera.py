@@ -30,6 +30,7 @@ from ortho_pipeline.models.base import (
     Array,
     SensorModel,
     as_ground,
+    as_heights,
     as_image,
     as_params,
     box_around,
@@ -274,7 +275,7 @@ class FrameCamera(SensorModel):
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         """Intersect the rays of image points ``(N, 2)`` with an ellipsoidal height; NaN where they miss."""
         image = as_image(image)
-        heights = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(image),))
+        heights = as_heights(height, len(image))
         with _quiet():
             return self._outside.follow(rays(self.interior, image), heights)
 

@@ -21,7 +21,15 @@ from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
-from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image, box_around, ground_of_corners
+from ortho_pipeline.models.base import (
+    Array,
+    SensorModel,
+    as_ground,
+    as_heights,
+    as_image,
+    box_around,
+    ground_of_corners,
+)
 
 #: Heights (m, ellipsoidal) of all ground.
 _HEIGHTS = -500.0, 9000.0
@@ -119,7 +127,7 @@ class MapGrid(SensorModel):
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         image = as_image(image)
         ground = np.empty((len(image), 3))
-        ground[:, 2] = height
+        ground[:, 2] = as_heights(height, len(image))
         ground[:, :2] = image @ self._matrix.T + self._origin
         ground[~(np.isfinite(image).all(axis=1) & np.isfinite(ground[:, 2]))] = np.nan
         return ground

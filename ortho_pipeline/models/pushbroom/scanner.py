@@ -55,6 +55,7 @@ from ortho_pipeline.models.base import (
     Constraints,
     SensorModel,
     as_ground,
+    as_heights,
     as_image,
     as_params,
     box_around,
@@ -286,7 +287,7 @@ class Pushbroom(SensorModel):
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         """Intersect the rays of image points ``(N, 2)`` with an ellipsoidal height; NaN where they miss."""
         origin, direction = self.rays(image)
-        heights = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(origin),))
+        heights = as_heights(height, len(origin))
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             ground = meet_height(origin, direction, heights)
             if self.light.refraction:
