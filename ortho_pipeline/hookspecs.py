@@ -217,9 +217,11 @@ class Scene:
         from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
         from ortho_pipeline.estimation.family_fit import OWN, fit_own
         from ortho_pipeline.estimation.fit import fit
+        from ortho_pipeline.estimation.observations.arguments import refuse_other_points
         from ortho_pipeline.models.correction import ImageCorrection
         from ortho_pipeline.options import CORRECTIONS
 
+        refuse_other_points(points)
         if correction not in CORRECTIONS:
             raise InputError(
                 f"unknown correction {correction!r}", field="correction", remedy=f"use one of {', '.join(CORRECTIONS)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+import math
 import re
 import subprocess
 import sys
@@ -381,3 +382,46 @@ def test_heights_of_another_number_are_refused_by_name(height, sample: Path) -> 
         model.image_to_ground([[500.0, 500.0], [501.0, 500.0]], height)
     with pytest.raises(InputError, match="ground is no array of numbers"):
         model.ground_to_image([[33.0, 37.0, 800.0], [33.0, 37.0]])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"points": "gcps.csv"}, r"a str is not a Points(.|\n)*op\.read_points"),
+        ({"exclude": {"G99": "wrong"}}, "cannot exclude 'G99': no control point has this id"),
+        ({"exclude": {"C01": "a check point"}}, "cannot exclude 'C01'"),
+        ({"exclude": ["G01"]}, "exclude must map ids to reasons"),
+        ({"priors": {"col_shift": (0.0, 1.0)}}, r"the prior of 'col_shift' is a tuple(.|\n)*op\.Prior"),
+    ],
+)
+def test_a_fit_refuses_what_it_would_ignore_or_cannot_use(arguments, message, sample: Path) -> None:
+    start = op.ImageCorrection.identity(op.open_scene(sample / "scene.tif").model, "shift", (500.0, 500.0))
+    points = op.read_points(sample / "gcps.geojson")
+    with pytest.raises(InputError, match=message):
+        op.fit(start, **{"points": points, **arguments})
+
+
+def test_points_are_no_path_of_a_file(sample: Path) -> None:
+    scene, path = op.open_scene(sample / "scene.tif"), str(sample / "gcps.geojson")
+    for takes_points in (scene.fit, lambda points: op.compare(points, ["dlt"]), lambda points: op.adjust({}, points)):
+        with pytest.raises(InputError, match="a str is not a"):
+            takes_points(path)
+
+
+def test_a_block_refuses_names_that_it_has_not(sample: Path) -> None:
+    points = op.read_block_points(sample / "cartosat" / "points.csv")
+    scenes = {name: op.open_scene(sample / "cartosat" / name) for name in points.images}
+    shifts = {name: op.ImageCorrection.identity(scene.model, "shift", (0, 0)) for name, scene in scenes.items()}
+    first = points.images[0]
+    for accuracies, message in (({"other": 3.0}, "no points of the image 'other'"), ({first: math.nan}, "is nan, not")):
+        with pytest.raises(InputError, match=message):
+            op.adjust(shifts, points, accuracies=accuracies)
+    with pytest.raises(InputError, match="a Scene is not a sensor model"):
+        op.adjust(scenes, points)
+    block = op.adjust(shifts, points, robust=False)
+    with pytest.raises(InputError, match="no role 'Check'"):
+        block.object_rms("Check")
+    with pytest.raises(InputError, match="no role 'Check'"):
+        block.image_rms(first, "Check")
+    with pytest.raises(InputError, match="no image 'other'"):
+        block.image_rms("other", "check")

@@ -120,7 +120,7 @@ def adjust(
     # What starts nowhere says nothing yet; where the images come right, it takes part.
     nowhere = np.asarray(~np.isfinite(state.local).all(axis=1))
     selection, notes = whole.without(nowhere, stated.point), list[Notice]()
-    stated_by = stated_accuracies(models) if accuracies is None else accuracies
+    stated_by = stated_accuracies(models) if accuracies is None else _checked_accuracies(accuracies, points)
     problem, gauge = with_datum(problem, state, selection, hold, stated_by)
     _refuse_too_few(problem, nowhere, selection, whole)
     if problem.unstated.any():
@@ -220,6 +220,15 @@ def _refuse_many_outside(problem: BlockProblem, outside: Mask, inside: Selection
             file=problem.points.source or None,
             remedy="give control points that two images show, or a DEM: they fix the heights of the block",
         )
+
+
+def _checked_accuracies(accuracies: Mapping[str, float], points: BlockPoints) -> Mapping[str, float]:
+    for image, sigma in accuracies.items():
+        if image not in points.images:
+            raise InputError(f"there are no points of the image {image!r}", field="accuracies")
+        if not 0 <= sigma < math.inf:
+            raise InputError(f"the accuracy of {image!r} is {sigma}, not a number of metres", field="accuracies")
+    return accuracies
 
 
 def _among(points: BlockPoints, ids: Set[str]) -> Mask:

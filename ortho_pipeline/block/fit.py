@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -147,6 +147,11 @@ def merged(*parts: Rmse | None) -> Rmse | None:
     return Rmse(col=math.sqrt(col), row=math.sqrt(row), total=math.sqrt(col + row), n=number)
 
 
+def _refuse_other(what: str, name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        raise InputError(f"there is no {what} {name!r}", field=what, remedy=f"use one of {', '.join(known)}")
+
+
 @dataclass(frozen=True, eq=False)
 class BlockFit:
     """Result of a bundle adjustment of N points, M rays and P parameters.
@@ -244,6 +249,8 @@ class BlockFit:
         """
         if which not in ("back_projected", "residuals", "raw_residuals"):
             raise InputError(f"there are no residuals {which!r}", field="which")
+        _refuse_other("role", role, ROLES)
+        _refuse_other("image", image, self.points.images)
         rays = self.points.image == self.points.images.index(image)
         rays &= self.points.roles[self.points.point] == role
         if role == "control" or which == "residuals":
@@ -255,6 +262,7 @@ class BlockFit:
 
     def object_rms(self, role: str = "check") -> ObjectRms | None:
         """Return root mean squares, least and greatest of the object-space residuals (m) of a role; None for none."""
+        _refuse_other("role", role, ROLES)
         values = self.object_residuals[self.points.roles == role]
         values = values[np.isfinite(values).all(axis=1)]
         if not len(values):

@@ -19,6 +19,7 @@ from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.projection.rays import linearised
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.estimation.observations.arguments import refuse_other_model, refuse_other_points
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 
@@ -143,6 +144,9 @@ def models_of(models: Mapping[str, SensorModel], points: BlockPoints) -> tuple[S
     InputError
         If an image has no model, or a model no image.
     """
+    refuse_other_points(points, BlockPoints, "read_block_points")
+    for model in models.values():
+        refuse_other_model(model)
     for here, there, what in (
         (points.images, models, "there is no model of the image"),
         (models, points.images, "there are no points of the image"),

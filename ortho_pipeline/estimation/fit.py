@@ -24,6 +24,7 @@ from ortho_pipeline.estimation.determinacy import (
     uncertain_edge,
     unstable,
 )
+from ortho_pipeline.estimation.observations.arguments import excluded_rows, refuse_other_model, refuse_other_points
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.records import (
@@ -308,15 +309,11 @@ def fit(
     >>> op.fit(op.ImageCorrection.identity(model, "shift", (500, 500)), points).values.round(2).tolist()
     [6.31, -4.14]
     """
-    if not isinstance(model, SensorModel):
-        raise InputError(
-            f"a {type(model).__name__} is not a sensor model",
-            field="model",
-            remedy='pass a model; for a scene, use scene.fit(points, "shift")',
-        )
+    refuse_other_model(model)
+    refuse_other_points(points)
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
-    known_bad = {points.ids.index(name): reason for name, reason in (exclude or {}).items() if name in points.ids}
+    known_bad = excluded_rows(points, exclude or {})
     common = _common_error(model, points, raw, priors, robust=robust)
     problem, warnings = _posed(model, _without(common, model, points), raw, priors, known_bad)
     keep, rejected, problem, strength = _searched(problem, points, ridge, robust=robust)

@@ -133,6 +133,13 @@ class Problem:
                 field="priors",
                 remedy=f"the model has these parameters: {', '.join(model.param_names) or 'none'}",
             )
+        other = [name for name, prior in priors.items() if not isinstance(prior, Prior)]
+        if other:
+            raise InputError(
+                f"the prior of {other[0]!r} is a {type(priors[other[0]]).__name__}",
+                field="priors",
+                remedy="give op.Prior(mean, sigma)",
+            )
         rows = np.flatnonzero(usable)
         chosen = points.select(rows)
         return cls(model, rows, chosen, ImageErrors.of(model, chosen), dict(priors))

@@ -23,6 +23,7 @@ from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.choice.recommendation import recommend
 from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
 from ortho_pipeline.estimation.fit import SIGNIFICANCE, Fit, Prior, fit
+from ortho_pipeline.estimation.observations.arguments import refuse_other_points
 from ortho_pipeline.estimation.records import LeftOut, NoticeDocument
 from ortho_pipeline.files.json.records import Count, Record, Words
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
@@ -183,6 +184,7 @@ def compare(
     >>> op.compare(points, ["affine3d", "dlt"], size=(1000, 1000)).recommended
     'affine3d'
     """
+    refuse_other_points(points)
     known = available_models(own)
     models = choose_models(models if isinstance(models, str) else ",".join(map(str, models)), own)
     job = _Job(own, dict(priors or {}), size, crs, heights, ridge)
