@@ -20,6 +20,8 @@ from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, number, short, sigm
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+#: Groups are smaller: a file has them as numbers, which are exact up to here.
+LAST_GROUP = 2**53
 #: Below this 1 - correlation^2, column and row depend on each other so much that the covariance is singular.
 _SINGULAR = 1e-12
 #: Off-diagonal elements that differ by less than this part of the trace are equal.
@@ -206,7 +208,7 @@ def read_image_errors(
 
 def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
     group = number(value, path, where)
-    if group != math.floor(group) or not 0 <= group < 2**53:
+    if group != math.floor(group) or not 0 <= group < LAST_GROUP:
         raise InputError(
             f"{short(value)} is not a group",
             file=path,

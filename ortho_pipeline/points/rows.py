@@ -301,6 +301,27 @@ def sigma_of(
     return value
 
 
+def refuse_odd_ids(ids: Sequence[str], path: str | os.PathLike[str]) -> None:
+    """Refuse ids that would be different when they are read again from a file."""
+    odd = next((name for name in ids if not name or name != plain_id(name) or not is_writable(name)), None)
+    if odd is not None:
+        raise InputError(
+            f"the id {short(odd)} would be different when it is read again",
+            file=path,
+            field="id",
+            remedy="use ids without line breaks, without blanks around them, and without several blanks in a row",
+        )
+
+
+def refuse_unreadable(
+    ids: Sequence[str], path: str | os.PathLike[str], field: str, readable: NDArray[np.bool_]
+) -> None:
+    """Refuse points with values that no reader would accept from a file."""
+    if not readable.all():
+        name = short(ids[int(readable.argmin())])
+        raise InputError(f"{field} of point {name} has a value that cannot be read again", file=path, field=field)
+
+
 def cells_of(path: str | os.PathLike[str], line: Line, delimiter: str) -> list[str]:
     """Return the cells of a line without blanks around them; a blank as delimiter means any white space."""
     if delimiter == " " and '"' not in line.text:

@@ -29,6 +29,7 @@ from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.ground import ground_of
 from ortho_pipeline.points.image_errors import (
+    LAST_GROUP,
     checked_common,
     checked_covariance,
     checked_groups,
@@ -43,17 +44,18 @@ from ortho_pipeline.points.image_errors import (
 from ortho_pipeline.points.rows import (
     CSV_COLUMNS,
     CSV_ERRORS,
+    MAX_SIGMA,
     ROLES,
     Placement,
     PointRow,
     Table,
     TablePoint,
-    is_writable,
     numbered_ids,
     origin_shift,
     plain_id,
     refuse_duplicates,
-    short,
+    refuse_odd_ids,
+    refuse_unreadable,
 )
 
 Array = NDArray[np.float64]
@@ -417,8 +419,8 @@ def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequen
     Raises
     ------
     InputError
-        For another suffix, an id that would change (with blanks around it, or several in a row), or a folder that
-        cannot be written.
+        For another suffix, a folder that cannot be written, and what could not be read again: an id with blanks around
+        it or several in a row, a `sigma_image` of 0, or NaN in `image`.
 
     Examples
     --------
@@ -431,19 +433,17 @@ def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequen
     writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}
     suffix = Path(path).suffix.lower()
     if suffix not in writers:
-        raise InputError(
-            "points cannot be written in this format", file=path, remedy=f"use one of {', '.join(writers)}"
-        )
+        remedy = f"use one of {', '.join(writers)}"
+        raise InputError("points cannot be written in this format", file=path, remedy=remedy)
     if images is not None and writers[suffix] is not _csv_text:
         raise InputError(f"{suffix} files cannot name the image of a point", file=path, remedy="write .csv")
-    odd = next((name for name in points.ids if not name or name != plain_id(name) or not is_writable(name)), None)
-    if odd is not None and writers[suffix] is not _qgis_text:
-        raise InputError(
-            f"the id {short(odd)} would be different when it is read again",
-            file=path,
-            field="id",
-            remedy="use ids without line breaks, without blanks around them, and without several blanks in a row",
-        )
+    ids, ground, sigma = points.ids, points.ground, points.sigma_image
+    if writers[suffix] is not _qgis_text:
+        refuse_odd_ids(ids, path)
+        refuse_unreadable(ids, path, "sigma_image", (sigma > 0) & (sigma <= MAX_SIGMA))
+        refuse_unreadable(ids, path, "groups", points.groups < LAST_GROUP)
+    refuse_unreadable(ids, path, "image", np.isfinite(points.image).all(axis=1))
+    refuse_unreadable(ids, path, "ground", np.isfinite(ground[:, :2]).all(axis=1) & ~np.isinf(ground[:, 2]))
     write_text(path, _csv_text(points, suffix, images) if images is not None else writers[suffix](points, suffix))
 
 

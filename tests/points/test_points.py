@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -573,3 +574,20 @@ def test_points_do_not_change_with_the_arrays_they_were_made_of() -> None:
     assert points.image.tolist() == [[1.0, 2.0], [3.0, 4.0]]
     assert points.ids == ("7", "8")
     assert len(points.select([])) == 0
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".geojson"])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("sigma_image", 0.0), ("sigma_image", 1e200), ("groups", 2**53), ("image", np.nan), ("image", np.inf),
+        ("ground", np.nan), ("ground", np.inf),
+    ],
+)  # fmt: skip
+def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, suffix: str, field: str, value: float) -> None:
+    points = some_points()
+    values = getattr(points, field).copy()
+    values[3] = value
+    with pytest.raises(InputError, match=f"{field} of point 'p 3'"):
+        write_points(replace(points, **{field: values, "covariance_image": None}), tmp_path / f"p{suffix}")
+    assert not list(tmp_path.iterdir())
