@@ -425,3 +425,22 @@ def test_a_block_refuses_names_that_it_has_not(sample: Path) -> None:
         block.image_rms(first, "Check")
     with pytest.raises(InputError, match="no image 'other'"):
         block.image_rms("other", "check")
+
+
+@pytest.mark.parametrize(
+    ("group", "values"),
+    [
+        (op.OutputOptions, {"memory": 512}),
+        (op.OutputOptions, {"memory": -1}),
+        (op.OutputOptions, {"threads": 0}),
+        (op.OutputOptions, {"threads": np.int64(-1)}),
+        (op.OutputOptions, {"tolerance": 0.0}),
+        (op.OutputOptions, {"tolerance": math.nan}),
+    ],
+)
+def test_a_number_beyond_the_bounds_of_its_option_is_refused(group, values) -> None:
+    (name,) = values
+    with pytest.raises(InputError, match=r"is not a .*number.* above ") as caught:
+        group(**values)
+    assert caught.value.field == f"output.{name}"
+    assert "MB" not in str(caught.value)

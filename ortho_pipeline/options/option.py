@@ -225,15 +225,29 @@ def _checking(init: Any) -> Any:
         for name, option in options_of(type(self)).items():
             value, kind = getattr(self, name), self.__init__.__annotations__[name]
             plain = _plain(value, option.kind, kind)
-            if plain is not None and not _fits(plain, option.kind, kind):
+            fits = plain is None or _fits(plain, option.kind, kind)
+            if not fits or not _within(plain, option):
                 form = "True or False" if kind is bool else "a path" if os.PathLike in _types(kind) else "a text"
-                form = _FORMS.get(option.kind, form)
+                form = _FORMS.get(option.kind, form) + (_range_of(option) if fits else "")
                 group = type(self).__name__.removesuffix("Options").lower()
                 group = {"point": "points", "block": "points"}.get(group, group)
                 raise InputError(f"{reprlib.repr(value)} is not {form}", field=f"{group}.{name}", remedy=f"give {form}")
             object.__setattr__(self, name, plain)
 
     return checked
+
+
+def _within(value: Any, option: Option) -> bool:
+    """Return whether a single number is between the bounds of its option."""
+    if not isinstance(value, int | float) or option.above is option.below is None:
+        return True
+    low, high = -math.inf if option.above is None else option.above, math.inf if option.below is None else option.below
+    return low < value < high
+
+
+def _range_of(option: Option) -> str:
+    bounds = (("above", option.above), ("below", option.below))
+    return "".join(f" {word} {bound:,.10g}" for word, bound in bounds if bound is not None)
 
 
 def _plain(value: Any, form: Kind, kind: Any) -> Any:
