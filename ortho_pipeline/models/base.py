@@ -363,7 +363,7 @@ def as_heights(heights: ArrayLike, count: int) -> Array:
 def as_numbers(values: ArrayLike, what: str) -> Array:
     """Return values as contiguous float64; NaN where a masked array has none."""
     if isinstance(values, np.ma.MaskedArray):
-        values = values.astype(np.float64).filled(np.nan)
+        values = np.ma.filled(values.astype(np.float64), np.nan)
     try:
         return np.asarray(values, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:

@@ -284,7 +284,7 @@ class Points:
 
 def _numbers(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     """Return a copy of the values as numbers, repeated to a shape; NaN where a masked array has none."""
-    values = values.astype(float).filled(np.nan) if isinstance(values, np.ma.MaskedArray) else values
+    values = np.ma.filled(values.astype(float), np.nan) if isinstance(values, np.ma.MaskedArray) else values
     try:
         numbers = np.array(values, dtype=float)
         return numbers if shape is None else np.broadcast_to(numbers, shape)
@@ -442,7 +442,7 @@ def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequen
         refuse_odd_ids(ids, path)
         refuse_unreadable(ids, path, "sigma_image", (sigma > 0) & (sigma <= MAX_SIGMA))
         refuse_unreadable(ids, path, "groups", points.groups < LAST_GROUP)
-    refuse_unreadable(ids, path, "image", np.isfinite(points.image).all(axis=1))
+    refuse_unreadable(ids, path, "image", np.asarray(np.isfinite(points.image).all(axis=1)))
     refuse_unreadable(ids, path, "ground", np.isfinite(ground[:, :2]).all(axis=1) & ~np.isinf(ground[:, 2]))
     write_text(path, _csv_text(points, suffix, images) if images is not None else writers[suffix](points, suffix))
 
