@@ -3,7 +3,8 @@
 GDAL's weighted Brovey method multiplies the upsampled bands of each pixel by the panchromatic value over their weighted
 sum. GDAL knows one nodata value and no mask, computes in the type of the panchromatic band, and before 3.7 stretches
 the bands to its extent. So both rasters are cut to one extent first. Where a mask or another nodata value hides pixels,
-GDAL computes in floating point with a nodata value that no pixel has. Other grids are resampled once, by GDAL's warper.
+GDAL upsamples the bands in floating point, with a nodata value that no pixel has, and `brovey` computes as GDAL does.
+Other grids are resampled once, by GDAL's warper.
 
 Source: Gillespie et al. 1987 (Brovey); GDAL, VRTPansharpenedDataset.
 """
@@ -148,10 +149,25 @@ class Pansharpened:
         if self._native and self._all_valid(left, top, width, height):
             pixels, valid = self._read(self._native_bands, window), np.ones((height, width), dtype=bool)
         else:
-            pixels = self._read(self._floating_bands, window)
-            valid = pixels[0] != _EMPTY
+            pixels, valid = self._computed(window)
             pixels = np.minimum(pixels, self._largest)
         return self._filled(pixels, valid), valid
+
+    def _computed(self, window: tuple[int, int, int, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Return pixels of a window in floating point, and which are valid."""
+        sharp, wide = self._floating_bands
+        left, top, width, height = window
+        factor = max(self.overlap.ratio, 1)
+        pan = self._read(sharp, window)[0]
+        coarse = left / factor, top / factor, width / factor, height / factor
+        colours = self._read(wide, coarse, (width, height)) if factor > 1 else self._read(wide, window)
+        colours = colours[: self._colours.count]
+        valid = (pan != _EMPTY) & (colours != _EMPTY).all(axis=0)
+        colours = within(colours, self._colours.dtype)
+        if self._native and colours.dtype != self._colours.dtype:
+            # As GDAL does in windows without empty pixels, so that there are no seams between both.
+            colours = np.floor(colours + 0.5)
+        return brovey(pan, colours, self._weights), valid
 
     def _filled(self, pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
         low, _, _, fill = value_range(self._profile.dtype, self._profile)
@@ -162,14 +178,19 @@ class Pansharpened:
             keep_off_nodata(out, np.broadcast_to(valid, out.shape), fill, low)
         return out
 
-    def _read(self, dataset: gdal.Dataset, window: tuple[int, int, int, int]) -> NDArray[Any]:
+    def _read(
+        self, dataset: gdal.Dataset, window: tuple[float, float, float, float], size: tuple[int, int] = (0, 0)
+    ) -> NDArray[Any]:
+        """Return a window, upsampled to a size if one is given."""
+        larger = {"buf_xsize": size[0], "buf_ysize": size[1], "resample_alg": gdal.GRIORA_Cubic} if any(size) else {}
         try:
-            pixels = dataset.ReadAsArray(*window)
+            pixels = dataset.ReadAsArray(*window, **larger)
         except RuntimeError as error:
             raise InputError(
                 f"GDAL cannot sharpen this ortho ({first_line(error)})", file=self._pan.path, remedy="make it again"
             ) from error
-        return np.asarray(pixels).reshape(-1, window[3], window[2])
+        rows, columns = np.asarray(pixels).shape[-2:]
+        return np.asarray(pixels).reshape(-1, rows, columns)
 
     def _all_valid(self, left: int, top: int, width: int, height: int) -> bool:
         """Return whether all pixels of a window and those that the upsampling needs about it are valid."""
@@ -189,18 +210,20 @@ class Pansharpened:
         """GDAL's pan-sharpened dataset of the rasters as they are."""
         own = [_cut(source, grid, self.overlap.whole) for source, grid in zip(self._sources, self._grids, strict=True)]
         nodata = "NONE" if self._nodata is None else repr(self._nodata)
-        return self._sharpened(own[0], own[1], nodata, self._colours.band_numbers)
+        # GDAL holds no reference to the datasets.
+        self._held += own
+        bands = [own[1].GetRasterBand(number) for number in self._colours.band_numbers]
+        return _virtual(own[0].GetRasterBand(1), bands, self._weights, nodata, self._threads)
 
     @cached_property
-    def _floating_bands(self) -> gdal.Dataset:
-        """GDAL's pan-sharpened dataset of the rasters in floating point, empty pixels marked."""
+    def _floating_bands(self) -> tuple[gdal.Dataset, gdal.Dataset]:
+        """Both rasters in floating point, empty pixels marked."""
         whole, coarse = self.overlap.whole, self.overlap.whole
         if self.overlap.ratio:
             factor = self.overlap.ratio
             coarse = coarser(whole, factor, whole.width // factor, whole.height // factor)
         pan = self._floating(self._pan, self._grids[0], whole, "near")
-        colours = self._floating(self._colours, self._grids[1], coarse, "near" if self.overlap.ratio else "cubic")
-        return self._sharpened(pan, colours, repr(_EMPTY))
+        return pan, self._floating(self._colours, self._grids[1], coarse, "near" if self.overlap.ratio else "cubic")
 
     @property
     def _sources(self) -> tuple[RasterSource, RasterSource]:
@@ -228,28 +251,24 @@ class Pansharpened:
             **more,
         )
 
-    def _sharpened(
-        self, pan: gdal.Dataset, colours: gdal.Dataset, nodata: str, numbers: Sequence[int] = ()
-    ) -> gdal.Dataset:
-        # GDAL holds no reference to the datasets.
-        self._held += [pan, colours]
-        bands = [colours.GetRasterBand(number) for number in numbers or range(1, self._colours.count + 1)]
-        return _virtual(pan.GetRasterBand(1), bands, self._weights, nodata, self._threads)
-
 
 # -- arrays ----------------------------------------------------------------------------------------------------------
 
 
-def sharpened(pan: NDArray[np.float32], colours: NDArray[np.float32], weights: Sequence[float]) -> NDArray[np.float64]:
-    """Return bands ``(n, h, w)`` that are sharpened by pixels ``(h, w)`` of the same area; NaN without a value.
+def brovey(pan: NDArray[Any], colours: NDArray[Any], weights: Sequence[float]) -> NDArray[Any]:
+    """Return upsampled bands ``(n, h, w)`` sharpened by pixels ``(h, w)``; 0 where the weighted sum is 0."""
+    below = np.tensordot(np.asarray(weights, dtype=colours.dtype), colours, axes=1)
+    factor = np.divide(pan, below, out=np.zeros_like(below), where=below != 0)
+    return np.asarray(colours * factor)
 
-    Parameters
-    ----------
-    colours : (n, h / ratio, w / ratio)
+
+def within(colours: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return upsampled bands within the range of their pixel type, as GDAL upsamples them.
+
+    Cubic convolution overshoots at edges. Negative values would make the weighted sum small and the quotient huge.
     """
-    fine, coarse = _in_memory(pan[None], 1.0), _in_memory(colours, pan.shape[0] / colours.shape[1])
-    bands = [coarse.GetRasterBand(number + 1) for number in range(len(colours))]
-    return _marked(_virtual(fine.GetRasterBand(1), bands, weights, repr(_EMPTY), 1).ReadAsArray())
+    limits = np.iinfo(dtype) if dtype.kind in "iu" else np.finfo(dtype)
+    return np.clip(colours, limits.min, limits.max)
 
 
 def upsampled(colours: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float64]:
@@ -303,10 +322,13 @@ def _virtual(
 
 
 def _common_nodata(pan: RasterSource, colours: RasterSource) -> float | None:
-    """Return the nodata value of all bands, if nothing else hides pixels; None if there is none."""
+    """Return the nodata value 0 of all bands, if nothing else hides pixels; else None.
+
+    With any other value, GDAL would also empty valid pixels whose weighted sum is 0.
+    """
     values = {*pan.nodata, *colours.nodata}
     flags = {source.bands[0].GetMaskFlags() for source in (pan, colours)}
-    if len(values) > 1 or flags != {gdal.GMF_NODATA} or "f" in (pan.dtype.kind, colours.dtype.kind):
+    if values != {0.0} or flags != {gdal.GMF_NODATA} or "f" in (pan.dtype.kind, colours.dtype.kind):
         return None
     return values.pop()
 

@@ -11,7 +11,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile
-from ortho_pipeline.raster.pansharpened import CommonExtent, Pansharpened, sharpened, upsampled
+from ortho_pipeline.raster.pansharpened import CommonExtent, Pansharpened, brovey, upsampled
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 
@@ -184,9 +184,37 @@ def test_arrays_are_sharpened_by_the_weighted_sum_of_their_bands() -> None:
     pan = np.full((8, 12), 500.0, np.float32)
     pan[3, 7], pan[6, 2] = 125.0, np.nan
     colours = np.stack([np.full((2, 3), 100.0), np.full((2, 3), 300.0)]).astype(np.float32)
-    found = sharpened(pan, colours, (0.25, 0.75))
+    found = brovey(pan, upsampled(colours, 8, 12), (0.25, 0.75))
     assert (found.shape, found.dtype) == ((2, 8, 12), np.float64)
     np.testing.assert_allclose(found, np.stack([pan / 2.5, pan / 2.5 * 3]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("hides", ["mask", "nodata"])
+def test_dark_pixels_next_to_bright_ones_are_the_same_where_others_are_empty(tmp_path: Path, hides: str) -> None:
+    """Cubic convolution undershoots below 0 there; and pixels of value 0 are valid."""
+    random = np.random.default_rng(1)
+    wide = random.integers(40, 300, (2, 48, 48)).astype(np.uint16)
+    for left, top in random.integers(0, 40, (8, 2)):
+        wide[:, top : top + 6, left : left + 6] = random.integers(1500, 4000, 2)[:, None, None]
+    wide[:, 30:40, 30:40] = 0
+    sharp = np.kron(wide.mean(axis=0, keepdims=True), np.ones((1, RATIO, RATIO))).astype(np.uint16)
+    grids = place(0, 0, 192, 192), place(0, 0, 48, 48, RATIO)
+    pan, colours = (write(tmp_path / f"{n}.tif", g, p) for n, g, p in zip("pc", grids, (sharp, wide), strict=True))
+    expected, everywhere = opened(pan, colours).read(0, 0, 192, 192)
+    assert everywhere.all()
+    nodata = 9999 if hides == "nodata" else None
+    sharp[:, :4] = 9999
+    holed = write(tmp_path / "h.tif", grids[0], sharp, nodata)
+    if nodata is None:
+        dataset = gdal.Open(str(holed), gdal.GA_Update)
+        dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
+        dataset.GetRasterBand(1).GetMaskBand().WriteArray((sharp[0] != 9999).astype(np.uint8) * 255)
+        dataset = None
+    else:
+        colours = write(tmp_path / "m.tif", grids[1], wide, nodata)
+    found, valid = opened(holed, colours).read(0, 0, 192, 192)
+    np.testing.assert_array_equal(valid, sharp[0] != 9999)
+    assert np.abs(found.astype(int) - expected)[:, 4:].max() <= 2
 
 
 def test_a_plane_stays_a_plane_when_it_is_upsampled() -> None:
@@ -207,7 +235,7 @@ def test_a_plane_stays_a_plane_when_it_is_upsampled() -> None:
 
 @pytest.mark.parametrize("bits", [11, 12])
 def test_pixels_of_few_bits_keep_to_them(tmp_path: Path, bits: int) -> None:
-    """Another nodata value in each raster, so GDAL computes in floating point."""
+    """Another nodata value in each raster, so pixels are computed in floating point."""
     sharp, wide = np.full((1, 64, 64), 60_000, np.uint16), np.full((2, 16, 16), 2000, np.uint16)
     sharp[0, 30:], sharp[0, 0, 0] = 1200, 1
     pan = write(tmp_path / "p.tif", place(0, 0, 64, 64), sharp, 1)

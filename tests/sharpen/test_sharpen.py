@@ -168,6 +168,17 @@ def test_drawn_bundles_are_better_than_upsampling(seed: int, tmp_path: Path) -> 
         assert quality["sharpened"]["ergas"] < quality["upsampled"]["ergas"]
 
 
+def test_bright_objects_next_to_dark_ground_do_not_spoil_the_quality() -> None:
+    """Upsampled pixels of unsigned types are not below 0, in the ortho and in the test of its quality."""
+    random = np.random.default_rng(1)
+    wide = random.integers(40, 300, (4, 128, 128)).astype(np.float32)
+    for left, top in random.integers(0, 100, (12, 2)):
+        wide[:, top : top + 24, left : left + 24] = random.integers(1500, 4000, 4)[:, None, None]
+    quality = reduced_quality([Sample(wide.mean(axis=0), wide)], [0.25] * 4, 4, np.dtype(np.uint16))
+    assert quality is not None
+    assert quality["sharpened"]["ergas"] < 0.5 * quality["upsampled"]["ergas"]
+
+
 def test_weights_are_never_negative() -> None:
     random = np.random.default_rng(0)
     bands = random.uniform(100, 200, (3, 40, 40)).astype(np.float32)

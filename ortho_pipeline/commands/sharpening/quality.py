@@ -15,14 +15,19 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.commands.sharpening.samples import Sample
 from ortho_pipeline.imaging.spectral_quality import QualitySums
-from ortho_pipeline.raster.pansharpened import sharpened, upsampled
+from ortho_pipeline.raster.pansharpened import brovey, upsampled, within
 
 #: Pixels of the reduced image at the rim of a window that are not compared: they need neighbours.
 _RIM = 3
 
 
-def reduced_quality(samples: Iterable[Sample], weights: Sequence[float], ratio: int) -> dict[str, Any] | None:
-    """Return the quality of sharpened and of upsampled windows as JSON values; None if the orthos are too small."""
+def reduced_quality(
+    samples: Iterable[Sample], weights: Sequence[float], ratio: int, dtype: np.dtype[Any] | None = None
+) -> dict[str, Any] | None:
+    """Return the quality of sharpened and of upsampled windows as JSON values; None if the orthos are too small.
+
+    `dtype` is the pixel type of the multispectral ortho, to whose range upsampled pixels keep.
+    """
     sums = {"sharpened": QualitySums(len(weights)), "upsampled": QualitySums(len(weights))}
     for pan, colours in samples:
         rows, columns = (side // ratio for side in pan.shape)
@@ -31,10 +36,9 @@ def reduced_quality(samples: Iterable[Sample], weights: Sequence[float], ratio: 
             continue
         # Where one pixel has no value, the mean has none.
         coarse = colours.reshape(len(colours), rows, ratio, columns, ratio).mean(axis=(2, 4))
-        images = {
-            "sharpened": sharpened(pan, coarse, weights),
-            "upsampled": upsampled(coarse, *pan.shape),
-        }
+        smooth = upsampled(coarse, *pan.shape)
+        smooth = smooth if dtype is None else within(smooth, dtype)
+        images = {"sharpened": brovey(pan, smooth, weights), "upsampled": smooth}
         rim = _RIM * ratio
         part = (slice(rim, -rim), slice(rim, -rim))
         valid: NDArray[np.bool_] = np.isfinite(np.concatenate([colours, *images.values()])).all(axis=0)

@@ -112,7 +112,7 @@ def sharpen(
     stage("Quality", 0.0)
     document = _document(pair, chosen, regression, weights is not None)
     document["registration"] = None if agreement is None else agreement.to_json()
-    document["quality"] = reduced_quality(samples, chosen, pair.whole_ratio)
+    document["quality"] = reduced_quality(samples, chosen, pair.whole_ratio, pair.sources[1].dtype)
     notices += _no_gain(document["quality"])
     samples.clear()
     with together(folder, stem):
