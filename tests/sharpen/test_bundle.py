@@ -15,12 +15,14 @@ from osgeo import gdal
 from seeds import SIZE, rpc
 
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.sharpening.bundle import taken_over
+from ortho_pipeline.commands.sharpening.bundle import _ratio_in, taken_over
 from ortho_pipeline.commands.sharpening.registration import Agreement
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.raster.source import Grid
 
 
 def coarse_scene() -> Scene:
@@ -33,12 +35,11 @@ def test_a_correction_is_taken_over_in_pixels_of_the_other_image(kind: str) -> N
     coefficients = {"none": np.zeros(6), "shift": np.array([3.0, 0, 0, -2.0, 0, 0])}
     affine = np.array([3.0, 1e-3, -2e-3, -2.0, 5e-4, 1.5e-3])
     adjusted = ImageCorrection(rpc(), kind, (40.0, 10.0), coefficients.get(kind, affine))
-    model, ratio = taken_over(adjusted, coarse_scene())
+    model = taken_over(adjusted, coarse_scene())
     image = np.random.default_rng(0).uniform(0, SIZE, (50, 2))
     ground = rpc().image_to_ground(image, rpc().h_off)
     # Outer corners agree, so a place in one image is a quarter of that in the other.
     np.testing.assert_allclose(4 * model.ground_to_image(ground), adjusted.ground_to_image(ground), atol=1e-3)
-    assert ratio == 4
 
 
 def test_images_that_are_no_bundle_are_refused() -> None:
@@ -99,6 +100,21 @@ def test_both_orthos_and_the_sharpened_one_share_a_grid(tmp_path: Path, monkeypa
     assert document["sharpening"]["ratio"] == 4
     sharp, wide = (ortho.ReadAsArray().astype(float)[:, valid] for ortho in (orthos[2], orthos[1]))
     np.testing.assert_allclose(sharp.mean(axis=1), wide.mean(axis=1), rtol=0.02)
+
+
+def test_the_ratio_is_that_of_the_pixels_of_the_ortho() -> None:
+    """With another resolution an original multispectral pixel is another number of pixels wide."""
+    scene, grids = coarse_scene(), {}
+    image = np.array([[SIZE[0] / 8, SIZE[1] / 8], [SIZE[0] / 8 + 1, SIZE[1] / 8]])
+    ground = scene.model.image_to_ground(image, scene.model.reference_height)
+    crs = parse_crs("EPSG:32636")
+    (west, north, *_), (east, south, *_) = ground_transform(scene.model.crs, crs)(ground)
+    width = float(np.hypot(east - west, north - south))
+    for part in (1, 2, 4, 8):
+        grids[part] = Grid(crs, west, north, width / part, width / part, 10, 10)
+    assert [_ratio_in(grids[part], scene.model, scene) for part in (2, 4, 8)] == [2, 4, 8]
+    with pytest.raises(InputError, match="no detail to add"):
+        _ratio_in(grids[1], scene.model, scene)
 
 
 def test_wrong_options_are_refused_before_any_work(tmp_path: Path) -> None:

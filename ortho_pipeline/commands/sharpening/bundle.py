@@ -29,7 +29,8 @@ from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.correction import COEFFICIENTS
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.pansharpened import colour_bands
-from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.raster.regridded import grid_of
+from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Progress
 
 #: Options that open one image and cannot open both.
@@ -73,7 +74,8 @@ def rectify_bundle(
     common: dict[str, Any] = {"surface": surface, "progress": progress, "command": command, "overwrite": overwrite}
     sharp = rectify(pan, folder, scene=scene, points=points, match=match, output=output, **common)
     adjusted = read_model_file(sharp.files["model"]).model
-    model, ratio = taken_over(adjusted, opened)
+    model = taken_over(adjusted, opened)
+    ratio = _ratio_in(grid_of(sharp.files["ortho"]), model, opened)
     corrected = dataclasses.replace(opened, models={model.kind: model}, adjusted={"from": Path(pan).name})
     access = SceneOptions(allow_network=scene.allow_network, roots=scene.roots)
     own = OutputOptions(
@@ -124,8 +126,30 @@ def _refuse_options(
         )
 
 
-def taken_over(adjusted: SensorModel, scene: Scene) -> tuple[SensorModel, int]:
-    """Return the model of a scene with the correction of the panchromatic model, and the ratio of their pixel sizes.
+def _ratio_in(grid: Grid, model: SensorModel, scene: Scene) -> int:
+    """Return how many pixels of an ortho a pixel in the middle of an image is wide.
+
+    Raises
+    ------
+    InputError
+        If the pixels of the ortho are about as large, so that there is no detail to add.
+    """
+    image = np.array([scene.width / 2, scene.height / 2]) + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    ground = ground_transform(model.crs, grid.crs)(model.image_to_ground(image, model.reference_height))
+    ratio = np.sqrt(abs(np.linalg.det((ground[1:, :2] - ground[0, :2]) / [grid.dx, grid.dy])))
+    if not ratio >= 1.5:
+        raise InputError(
+            f"the pixels of this image are {significant(float(ratio))} times as wide as those of the ortho, so there "
+            "is no detail to add",
+            file=scene.path,
+            field="output.resolution",
+            remedy=Text("leave out ", Setting("output.resolution"), ", or make the ortho of this image alone"),
+        )
+    return round(float(ratio))
+
+
+def taken_over(adjusted: SensorModel, scene: Scene) -> SensorModel:
+    """Return the model of a scene with the correction of the panchromatic model.
 
     Raises
     ------
@@ -160,7 +184,7 @@ def taken_over(adjusted: SensorModel, scene: Scene) -> tuple[SensorModel, int]:
             ),
         )
     if not isinstance(adjusted, ImageCorrection):
-        return scene.model, round(ratio)
+        return scene.model
     image = np.array([adjusted.origin])
     ground = ground_transform(delivered.crs, scene.model.crs)(
         delivered.image_to_ground(image, delivered.reference_height)
@@ -168,4 +192,4 @@ def taken_over(adjusted: SensorModel, scene: Scene) -> tuple[SensorModel, int]:
     ((column, row),) = scene.model.ground_to_image(ground).tolist()
     shifts = np.array([name.endswith("_shift") for name in COEFFICIENTS])
     coefficients = np.where(shifts, adjusted.coefficients / ratio, adjusted.coefficients)
-    return ImageCorrection(scene.model, adjusted.correction, (column, row), coefficients), round(ratio)
+    return ImageCorrection(scene.model, adjusted.correction, (column, row), coefficients)
