@@ -85,13 +85,15 @@ def test_both_orthos_and_the_sharpened_one_share_a_grid(tmp_path: Path, monkeypa
     monkeypatch.setattr("ortho_pipeline.commands.sharpening.sharpen.measure_agreement", lambda *_: agreement)
     result = run(
         "rectify", pan, "--sharpen", colours, "--height", height, "--gcps", tmp_path / "gcps.csv", "--points-crs",
-        "EPSG:4326", "--points-vertical", "ellipsoid", "-o", tmp_path / "out", "--json",
+        "EPSG:4326", "--points-vertical", "ellipsoid", "-of", "GTiff", "-co", "COMPRESS=LZW", "-o", tmp_path / "out",
+        "--json",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
     orthos = [gdal.Open(document["files"][name]) for name in ("ortho", "multispectral", "sharpened")]
     assert len({ortho.GetGeoTransform() for ortho in orthos}) == 1
     assert [ortho.RasterCount for ortho in orthos] == [1, 4, 4]
+    assert {ortho.GetMetadataItem("COMPRESSION", "IMAGE_STRUCTURE") for ortho in orthos} == {"LZW"}
     saved = json.loads((tmp_path / "out" / "ms_model.json").read_text())
     coefficients = saved.get("model", saved)["coefficients"]
     np.testing.assert_allclose([coefficients[0], coefficients[3]], [0.5, -0.25], atol=1e-3)

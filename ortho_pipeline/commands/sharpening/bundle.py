@@ -79,8 +79,9 @@ def rectify_bundle(
     corrected = dataclasses.replace(opened, models={model.kind: model}, adjusted={"from": Path(pan).name})
     access = SceneOptions(allow_network=scene.allow_network, roots=scene.roots)
     own = OutputOptions(
-        like=sharp.files["ortho"], resampling="cubic", nodata=output.nodata, memory=output.memory,
-        threads=output.threads, tolerance=output.tolerance, dem_interpolation=output.dem_interpolation,
+        like=sharp.files["ortho"], resampling="cubic", nodata=output.nodata, format=output.format,
+        creation_options=output.creation_options, memory=output.memory, threads=output.threads,
+        tolerance=output.tolerance, dem_interpolation=output.dem_interpolation,
     )  # fmt: skip
     wide = rectify(corrected, folder, scene=access, output=own, **common)
     done = sharpen(
