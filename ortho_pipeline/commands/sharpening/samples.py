@@ -1,14 +1,16 @@
 """Samples of two orthos on one coarse grid, and the weights of the multispectral bands in the panchromatic one.
 
-The panchromatic pixels are averaged to the multispectral pixel size. GDAL divides by the weighted sum of the bands, so
-the regression has no constant; a constant would change the brightness. Weights are not negative, as sensitivities are.
+The panchromatic pixels are averaged to the multispectral pixel size. Those of the highest value may be saturated, as on
+clouds, where the bands are brighter than they show, so they take no part. GDAL divides by the weighted sum of the
+bands, so the regression has no constant; a constant would change the brightness. Weights are not negative, as
+sensitivities are.
 
 Source: Lawson and Hanson 1974 (non-negative least squares).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -82,7 +84,7 @@ def read_samples(pan: Regridded, colours: Regridded, bands: Sequence[int], grid:
     return samples
 
 
-def regress(samples: Iterable[Sample], count: int) -> Weights:
+def regress(samples: Sequence[Sample], count: int) -> Weights:
     """Return the non-negative weights of so many bands that explain the panchromatic pixels best.
 
     Raises
@@ -90,10 +92,16 @@ def regress(samples: Iterable[Sample], count: int) -> Weights:
     InputError
         If too few pixels have a value in both orthos, or no band is positively related to the panchromatic one.
     """
+    valid = [np.isfinite(sample.pan) & np.isfinite(sample.colours).all(axis=0) for sample in samples]
+    highest = max(
+        (sample.pan[good].max() for sample, good in zip(samples, valid, strict=True) if good.any()), default=0
+    )
+    below = [good & (sample.pan < highest) for sample, good in zip(samples, valid, strict=True)]
+    # An even image has no pixels of another value.
+    used = below if sum(map(np.count_nonzero, below)) >= _FEWEST * count else valid
     normal, right = np.zeros((count, count)), np.zeros(count)
     pixels, total, squares = 0, 0.0, 0.0
-    for sample in samples:
-        good = np.isfinite(sample.pan) & np.isfinite(sample.colours).all(axis=0)
+    for sample, good in zip(samples, used, strict=True):
         design, observed = sample.colours[:, good].T.astype(np.float64), sample.pan[good].astype(np.float64)
         normal += design.T @ design
         right += design.T @ observed
