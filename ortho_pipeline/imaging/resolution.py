@@ -220,11 +220,12 @@ def _pixels(source: RasterSource, band: int, left: int, top: int, width: int, he
 
 
 def _limits(source: RasterSource) -> tuple[float, ...]:
-    """Return the values of saturated pixels: the ends of an integer type."""
+    """Return the values of saturated pixels: the ends of an integer type, and the largest of so many bits."""
     if source.dtype.kind not in "iu":
         return ()
     ends = np.iinfo(source.dtype)
-    return float(ends.min), float(ends.max)
+    bits = {band.GetMetadataItem("NBITS", "IMAGE_STRUCTURE") for band in source.bands} - {None}
+    return float(ends.min), float(ends.max), *(2.0 ** int(number) - 1 for number in bits)
 
 
 def _moved(edge: Edge, left: int, top: int) -> Edge:

@@ -284,6 +284,18 @@ def test_saturated_edges_are_refused(tmp_path, levels):
         resolution.measure(path)
 
 
+def test_saturated_edges_of_few_bits_are_refused(tmp_path):
+    """Clipped at 2047, an edge of 0.6 px would look like one of 0.45 px."""
+    pixels, segment = edge_image(0.6, 8.0, levels=(300.0, 2500.0), noise=2.0)
+    path = tmp_path / "bright.tif"
+    size = pixels.shape[::-1]
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), *size, 1, gdal.GDT_UInt16, ["NBITS=11"])
+    dataset.WriteArray(np.clip(np.rint(pixels), 0, 2047).astype(np.uint16))
+    del dataset
+    with pytest.raises(InputError, match="next to the edge are saturated"):
+        resolution.measure(path, edge=segment)
+
+
 def test_an_image_without_edges_is_an_error(tmp_path):
     flat = np.random.default_rng(0).normal(500.0, 5.0, (100, 100))
     for pixels in (flat, np.full((100, 100), 3.0), np.zeros((3, 3))):
