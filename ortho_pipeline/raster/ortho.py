@@ -18,7 +18,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import whole_or_nothing
-from ortho_pipeline.raster.pixel_types import holds, pixel_type
+from ortho_pipeline.raster.pixel_types import gdal_type, holds, pixel_type
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.raster.stored_crs import stored_wkt
 from ortho_pipeline.raster.verified_writing import (
@@ -27,6 +27,7 @@ from ortho_pipeline.raster.verified_writing import (
     checked_options,
     close,
     gdal_errors,
+    require_writable,
     retire_attached,
 )
 from ortho_pipeline.runtime.process_limits import Progress, claim_gdal_threads
@@ -276,6 +277,8 @@ class RasterWriter:
         # The bands of a block are adjacent in the file, and GDAL keeps several such blocks.
         self._side = square_side(profile, 512)
         self.options = checked_options(driver, dict(creation_options or {}), threads, self._side)
+        if creation_options:
+            require_writable(driver, self.options, profile.count, gdal_type(profile.dtype))
         if threads > 1 or self.options.get("NUM_THREADS", "1") != "1":
             claim_gdal_threads()
         self._lock = threading.Lock()
@@ -330,10 +333,8 @@ class RasterWriter:
         return beside and (bottom == self.grid.height or bottom % down == 0)
 
     def _create(self, path: Path | None, options: Mapping[str, str]) -> gdal.Dataset:
-        from osgeo import gdal_array
-
         profile, grid = self.profile, self.grid
-        code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
+        code = gdal_type(profile.dtype)
         with gdal_errors(self.path), contextlib.ExitStack() as failed:
             driver, where = ("MEM", "") if path is None else ("GTiff", str(path))
             creation = [] if path is None else [f"{k}={v}" for k, v in options.items()]

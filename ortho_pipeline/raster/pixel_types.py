@@ -21,6 +21,13 @@ def numpy_type(gdal_type: int) -> np.dtype[Any]:
     return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))
 
 
+def gdal_type(dtype: np.dtype[Any]) -> int:
+    """Return GDAL's number of a pixel type."""
+    from osgeo import gdal_array
+
+    return int(gdal_array.NumericTypeCodeToGDALTypeCode(dtype.type))
+
+
 def check_types(bands: Sequence[gdal.Band], path: str) -> None:
     """Raise an `InputError` if the pixels of a band cannot be read as numbers that can be resampled."""
     if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):

@@ -13,7 +13,7 @@ import math
 import os
 import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import retire, whole_or_nothing
 from ortho_pipeline.files.locations import VsiPath
 from ortho_pipeline.raster.source import first_line, open_dataset
@@ -318,6 +318,39 @@ def checked_options(driver: str, chosen: dict[str, str], threads: int, side: int
             defaults.pop("PREDICTOR")
             defaults.pop("LEVEL")
     return defaults | chosen
+
+
+def require_writable(driver: str, options: Mapping[str, str], count: int, code: int) -> None:
+    """Refuse creation options with which so many bands of a pixel type cannot be written: write a pixel, in memory.
+
+    GDAL's threads lose the text of an error, and it would come after all the work.
+
+    Raises
+    ------
+    InputError
+        With GDAL's reason.
+    """
+    place = VsiPath(f"/vsimem/ortho_options_{secrets.token_hex(8)}.tif")
+    alone = [f"{key}={value}" for key, value in options.items() if key != "NUM_THREADS"]
+    try:
+        if driver == "GTiff":
+            pixel = gdal.GetDriverByName(driver).Create(str(place), 1, 1, count, code, alone)
+            for number in range(1, count + 1):
+                pixel.GetRasterBand(number).Fill(1)
+        else:
+            memory = gdal.GetDriverByName("MEM").Create("", 1, 1, count, code)
+            pixel = gdal.GetDriverByName(driver).CreateCopy(str(place), memory, options=alone)
+        close(pixel)
+    except RuntimeError as error:
+        raise InputError(
+            f"GDAL cannot write {counted(count, 'band')} of {gdal.GetDataTypeName(code)} with these creation options "
+            f"({first_line(error).replace(f'{place}: ', '')})",
+            field="creation option",
+            remedy="correct the creation options, or leave them out",
+        ) from error
+    finally:
+        with contextlib.suppress(RuntimeError):  # there may be no file
+            gdal.Unlink(str(place))
 
 
 def _known_options(driver: str) -> dict[str, Any]:

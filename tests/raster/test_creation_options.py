@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
+import pyproj
 import pytest
+from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster.verified_writing import _fits, checked_options
+from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.raster.verified_writing import _fits, checked_options, require_writable
 
 TILES = {"TILED": "YES", "BLOCKXSIZE": "384", "BLOCKYSIZE": "384"}
 PACKED = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "6"}
@@ -86,3 +92,38 @@ def test_a_choice_is_one_of_its_values_or_their_other_names() -> None:
     )
     assert [_fits(element, value) for value in ("yes", "Best", "AUTO", "no")] == [True, True, True, False]
     assert _fits(ElementTree.fromstring("<Option name='X' type='string-select'/>"), "free")
+
+
+@pytest.mark.parametrize(
+    ("driver", "chosen", "reason"),
+    [
+        ("COG", {"COMPRESS": "JPEG"}, "not allowed for JPEG"),
+        ("COG", {"COMPRESS": "WEBP"}, "8 bit"),
+        ("COG", {"BLOCKSIZE": "500"}, "Bad value 500"),
+        ("GTiff", {"COMPRESS": "LZW", "PREDICTOR": "3"}, "PREDICTOR=3"),
+        ("GTiff", {"BLOCKXSIZE": "100"}, "Bad value 100"),
+    ],
+)
+def test_options_that_do_not_suit_the_pixels_are_refused_at_once(
+    driver: str, chosen: dict[str, str], reason: str
+) -> None:
+    with pytest.raises(InputError, match=f"4 bands of UInt16 .*{reason}") as refused:
+        require_writable(driver, checked_options(driver, chosen, 2), 4, gdal.GDT_UInt16)
+    assert "vsimem" not in str(refused.value)
+
+
+def test_an_ortho_is_refused_before_its_first_pixel(tmp_path: Path) -> None:
+    grid = Grid(pyproj.CRS("EPSG:32636"), 500_000.0, 4_100_000.0, 2.0, 2.0, 8, 8)
+    profile = Profile(1, np.dtype(np.uint16), "mask")
+    with pytest.raises(InputError, match="1 band of UInt16"):
+        RasterWriter(tmp_path / "ortho.tif", grid, profile, creation_options={"COMPRESS": "JPEG"}, threads=2)
+
+
+def test_options_that_suit_the_pixels_are_accepted() -> None:
+    for driver, chosen in (
+        ("COG", {"COMPRESS": "JPEG"}), ("COG", {"COMPRESS": "LERC", "MAX_Z_ERROR": "0.5"}),
+        ("COG", {"OVERVIEWS": "NONE"}),
+        ("GTiff", {"COMPRESS": "JPEG", "PHOTOMETRIC": "YCBCR"}), ("GTiff", {"TILED": "NO", "BLOCKYSIZE": "7"}),
+        ("GTiff", {"INTERLEAVE": "BAND", "COMPRESS": "ZSTD", "PREDICTOR": "2"}),
+    ):  # fmt: skip
+        require_writable(driver, checked_options(driver, chosen, 2), 3, gdal.GDT_Byte)
