@@ -25,7 +25,7 @@ Other()
 """
 PREPARE = {
     "worker": "from ortho_pipeline.batch.executors import start_worker; start_worker(1)",
-    "command": "from ortho_pipeline.runtime.signals import ended_by_signals; block = ended_by_signals(); block.__enter__()",
+    "command": "from ortho_pipeline.runtime import signals; block = signals.ended_by_signals(); block.__enter__()",
 }
 
 

@@ -12,12 +12,12 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline import commands
-from ortho_pipeline.runtime.signals import Terminated
 from ortho_pipeline.errors import InputError, PluginError
 from ortho_pipeline.exchange.rpc import rpc_metadata, write_rpc_txt
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.host import Host
 from ortho_pipeline.models import RPC, SensorModel
+from ortho_pipeline.runtime.signals import Terminated
 
 gdal.UseExceptions()
 
