@@ -331,7 +331,9 @@ def require_writable(driver: str, options: Mapping[str, str], count: int, code: 
         With GDAL's reason.
     """
     place = VsiPath(f"/vsimem/ortho_options_{secrets.token_hex(8)}.tif")
-    alone = [f"{key}={value}" for key, value in options.items() if key != "NUM_THREADS"]
+    # A pixel has no overviews.
+    left_out = ("NUM_THREADS", "OVERVIEWS", "OVERVIEW_COUNT")
+    alone = [f"{key}={value}" for key, value in options.items() if key not in left_out]
     try:
         if driver == "GTiff":
             pixel = gdal.GetDriverByName(driver).Create(str(place), 1, 1, count, code, alone)

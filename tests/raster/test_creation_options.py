@@ -122,7 +122,7 @@ def test_an_ortho_is_refused_before_its_first_pixel(tmp_path: Path) -> None:
 def test_options_that_suit_the_pixels_are_accepted() -> None:
     for driver, chosen in (
         ("COG", {"COMPRESS": "JPEG"}), ("COG", {"COMPRESS": "LERC", "MAX_Z_ERROR": "0.5"}),
-        ("COG", {"OVERVIEWS": "NONE"}),
+        ("COG", {"OVERVIEWS": "NONE"}), ("COG", {"OVERVIEW_COUNT": "2", "OVERVIEW_RESAMPLING": "NEAREST"}),
         ("GTiff", {"COMPRESS": "JPEG", "PHOTOMETRIC": "YCBCR"}), ("GTiff", {"TILED": "NO", "BLOCKYSIZE": "7"}),
         ("GTiff", {"INTERLEAVE": "BAND", "COMPRESS": "ZSTD", "PREDICTOR": "2"}),
     ):  # fmt: skip
