@@ -194,7 +194,7 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         grid,
         profile,
         driver=job.driver,
-        creation_options=job.creation_options,
+        creation_options=job.layout(),
         threads=threads,
         progress=job.resources.progress,
     )

@@ -78,6 +78,13 @@ class WarpJob:
         require_memory(self.resources.memory, 2 * wanted)
         return max(1, startable_threads(2 * wanted) // 2)
 
+    def layout(self) -> dict[str, str]:
+        """Return the creation options; where pixels are not mixed, overviews do not mix them either."""
+        chosen = {key.upper(): value for key, value in self.creation_options.items()}
+        if self.driver == "COG" and self.resampling == "nearest" and "RESAMPLING" not in chosen:
+            return {"OVERVIEW_RESAMPLING": "NEAREST"} | chosen
+        return chosen
+
     def check(self) -> None:
         """Refuse an unknown kernel, and pixels that cannot be interpolated."""
         if self.resampling not in KERNELS:

@@ -526,10 +526,16 @@ def test_bands_are_warped_alike(scene, tmp_path):
 def test_values_of_nearest_are_values_of_the_source(scene, tmp_path):
     pixels = (np.random.default_rng(0).integers(0, 2, (1, HEIGHT, WIDTH)) * 7).astype(np.uint8)
     path = scene.write(pixels)
-    rectify(scene.model, RasterSource(path), scene.surface(), grid_of(200.0), tmp_path / "o.tif", resampling="nearest")
+    rectify(
+        scene.model, RasterSource(path), scene.surface(), grid_of(200.0), tmp_path / "o.tif", resampling="nearest",
+        creation_options={"blocksize": "128", "OVERVIEW_COUNT": "1"},
+    )  # fmt: skip
     found, valid = read(tmp_path / "o.tif")
     assert set(np.unique(found[0][valid])) == {0, 7}
     assert valid.all()  # a valid 0 stays valid
+    # Values of classes do not mix in overviews either, as they would by default.
+    ortho = gdal.Open(str(tmp_path / "o.tif"))
+    assert set(np.unique(ortho.GetRasterBand(1).GetOverview(0).ReadAsArray())) == {0, 7}
 
 
 @pytest.mark.parametrize("kernel", ["bilinear", "cubic", "lanczos", "average"])
