@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -122,3 +123,13 @@ def f1(found: np.ndarray, wanted: np.ndarray) -> float:
     """Return the F1 score of a mask: 1 where both are the same."""
     both = (found & wanted).sum()
     return float(2 * both / max(found.sum() + wanted.sum(), 1)) if wanted.any() or found.any() else 1.0
+
+
+def slopes_of(surface: Surface, sight: Any, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return the rise per metre true east and north over pixels."""
+
+    def at(column: float, row: float) -> np.ndarray:
+        return surface.heights(np.stack(sight.grid.xy(columns + column, rows + row), axis=1), sight.grid.crs)
+
+    rise = np.stack([at(0.5, 0) - at(-0.5, 0), at(0, 0.5) - at(0, -0.5)], axis=1)
+    return np.einsum("ni,nij->nj", rise, np.linalg.inv(sight.metres(columns, rows, np.full(len(rows), FLOOR))))

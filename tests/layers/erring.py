@@ -170,8 +170,12 @@ def follow(truth: Truth, made: Fit, sigma: float, errors: Field, image: np.ndarr
     """Follow the pixels of the ortho in which the places of `image` are seen, about."""
     to_map = pyproj.Transformer.from_crs(4326, truth.zone, always_xy=True)
     xy = np.stack(to_map.transform(*truth.meet(image)[:, :2].T), axis=1)
-    lon, lat = to_map.transform(*xy.T, direction="INVERSE")
-    heights = truth.terrain(lon, lat) + errors(xy)
+
+    def dem(places: np.ndarray) -> np.ndarray:
+        return truth.terrain(*to_map.transform(*places.T, direction="INVERSE")) + errors(places)
+
+    heights = dem(xy)
+    rise = np.stack([dem(xy + half) - dem(xy - half) for half in ([0.5, 0.0], [0.0, -0.5])], axis=1)
     grid = Grid(pyproj.CRS.from_epsg(truth.zone), xy[:, 0].min(), xy[:, 1].max(), 1.0, 1.0, 4_000_000, 4_000_000)
     sight = Sight(made.model, grid)
     columns, rows = xy[:, 0] - grid.left, grid.top - xy[:, 1]
@@ -183,6 +187,7 @@ def follow(truth: Truth, made: Fit, sigma: float, errors: Field, image: np.ndarr
         columns,
         rows,
         heights,
+        slopes=np.einsum("ni,nij->nj", rise, np.linalg.inv(sight.metres(columns, rows, heights))),
     )
     return Trial(there - xy, parts, made)
 

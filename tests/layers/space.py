@@ -128,15 +128,26 @@ class Satellite(SensorModel):
             distance -= (height - at[:, 2]) / -np.einsum("nj,nj->n", axes(at)[:, 2], rays)
         return self.centre + distance[:, None] * rays
 
-    def ellipse(self, lonlat: np.ndarray, covariance: np.ndarray, sigma_h: float) -> np.ndarray:
-        """Return covariances ``(N, 2, 2)`` east, north (m) of what is shown at places, by moving rays and heights."""
+    def ellipse(
+        self, lonlat: np.ndarray, covariance: np.ndarray, sigma_h: float, slopes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return covariances ``(N, 2, 2)`` east, north (m) of what is shown at places, by moving rays and heights.
+
+        Rays meet planes of slopes ``(N, 2)``, rise per metre east and north. Also return by how much a ray rises
+        against the ground in front of it, per metre of its own: it is 0 where a ray grazes the ground.
+        """
         image = self.ground_to_image(np.column_stack(self._to.transform(*lonlat.T)))
         frame, half = axes(lonlat), 0.5
         moved = [self.seen_at(image + half * sign * step, lonlat[:, 2]) for step in np.eye(2) for sign in (1, -1)]
         higher = [self.seen_at(image, lonlat[:, 2] + half * sign) for sign in (1, -1)]
         by = [np.einsum("nij,nj->ni", frame, a - b)[:, :2] for a, b in zip(moved[::2], moved[1::2], strict=True)]
-        pixels, height = np.stack(by, axis=2), np.einsum("nij,nj->ni", frame, higher[0] - higher[1])[:, :2]
-        return pixels @ covariance @ pixels.transpose(0, 2, 1) + sigma_h**2 * height[:, :, None] * height[:, None, :]
+        pixels, way = np.stack(by, axis=2), np.einsum("nij,nj->ni", frame, higher[0] - higher[1])[:, :2]
+        rising = 1 - np.einsum("ni,ni->n", slopes, way)
+        # From the height of the place, a ray goes up along its way until it meets the plane.
+        up = np.einsum("ni,nij->nj", slopes, pixels) / rising[:, None]
+        pixels, height = pixels + way[:, :, None] * up[:, None, :], way / rising[:, None]
+        spread = sigma_h**2 * height[:, :, None] * height[:, None, :]
+        return pixels @ covariance @ pixels.transpose(0, 2, 1) + spread, rising
 
 
 def radius_of(covariance: np.ndarray, share: float = 0.9) -> np.ndarray:

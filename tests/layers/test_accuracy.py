@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pyproj
 import pytest
-from blocks import FLOOR, NORTH, WEST, City, Parallel
+from blocks import FLOOR, NORTH, WEST, City, Parallel, slopes_of
 from osgeo import gdal
 from scipy import stats
 
@@ -20,7 +20,7 @@ from ortho_pipeline.warp.quality.accuracy import Budget, layer_grid, parts_at, p
 from ortho_pipeline.warp.quality.error_ellipse import circular_error
 from ortho_pipeline.warp.quality.sight import Sight
 
-UTM = pyproj.CRS.from_epsg(32634)
+UTM, UTM36 = pyproj.CRS.from_epsg(32634), pyproj.CRS.from_epsg(32636)
 SIZE = (400, 300)
 
 
@@ -82,7 +82,9 @@ def test_the_file_holds_what_the_parts_say_at_its_pixels(tiny, tmp_path):
     sight = Sight(model, small)
     image = sight.image(columns, rows, heights)
     inside = ((image >= 0) & (image <= SIZE)).all(axis=1)
-    wanted = parts_at(budget, sight, columns, rows, heights).total
+    slopes = slopes_of(dem, sight, columns, rows)
+    parts = parts_at(budget, sight, columns, rows, heights, slopes=slopes)
+    wanted = parts.total
     found = bands.reshape(4, -1)
     np.testing.assert_array_equal(np.isfinite(found[3]), inside)
     assert 0.3 < inside.mean() < 0.95
@@ -91,7 +93,7 @@ def test_the_file_holds_what_the_parts_say_at_its_pixels(tiny, tmp_path):
     np.testing.assert_allclose(found[3][inside], circular_error(wanted[inside]), rtol=0.005)
     rho = wanted[inside, 2] / np.sqrt(wanted[inside, 0] * wanted[inside, 1])
     np.testing.assert_allclose(found[2][inside], rho, atol=0.005)
-    shares = np.array([one[inside, :2].sum() for one in parts_at(budget, sight, columns, rows, heights)])
+    shares = np.array([one[inside, :2].sum() for one in parts])
     np.testing.assert_allclose(list(made.shares.values()), shares / shares.sum(), atol=0.005)
     assert made.quantiles[0] < made.ce90 < made.quantiles[2]
     assert np.nanmax(made.cells) <= np.nanmax(found[3])
@@ -172,6 +174,50 @@ def test_parallel_rays_have_the_parts_of_a_plain_formula():
     # Heights of a raster: those at the place count instead.
     other = parts_at(budget, sight, *place, sigma_heights=np.array([1.0]))
     np.testing.assert_allclose(other.heights, [np.array([0.9, 1.6, -1.2]) * square], rtol=1e-4)
+
+
+@pytest.mark.parametrize("slope", [(0.5, 0.0), (-0.5, 0.0), (0.3, 0.6), (-0.8, 0.7), (0.9, -0.6)])
+def test_on_a_slope_errors_are_those_of_rays_that_meet_it(slope, tmp_path):
+    """Ground that turns away from the sensor is off by more, and ground that faces it by less."""
+    model = Parallel(0.6, -0.3, 2.0, 256.0)
+    corner, x = np.array([WEST - 40.5, NORTH + 40.5]), np.arange(340.0)
+    rise = FLOOR + slope[0] * (x - 168.0) - slope[1] * (x[:, None] - 168.0)
+    write_dem(tmp_path / "dem.tif", rise, tuple(corner), 1.0, "EPSG:32636")
+    dem, sight = open_dem(tmp_path / "dem.tif", "ellipsoid"), Sight(model, City(()).grid(2.0))
+    place = np.array([41.5]), np.array([77.5])
+    at = np.stack(sight.grid.xy(*place), axis=1)
+    height = dem.heights(at, UTM36)
+
+    def met(image):
+        """Return where a ray meets the plane of the slope, from the place, metres on the map."""
+        way = np.array([model.east, model.north])
+        foot = np.array([image[0] * 2.0 + WEST, NORTH - image[1] * 2.0]) - at[0]  # at the height of the floor
+        up = (height[0] - FLOOR + foot @ slope) / (1.0 - way @ slope)
+        return foot + way * up
+
+    seen = sight.image(*place, height)[0]
+    np.testing.assert_allclose(met(seen), 0.0, atol=1e-6)
+    off = np.array([met(sight.image(*place, height + 1.0)[0]), met(seen + np.eye(2)[0]), met(seen + np.eye(2)[1])])
+    slopes = slopes_of(dem, sight, *place)
+    parts = parts_at(Budget(heights=1.0), sight, *place, height, slopes=slopes)
+    by_map = TRUE**2 * np.array([[one[0] ** 2, one[1] ** 2, one[0] * one[1]] for one in off])
+    np.testing.assert_allclose(parts.heights, by_map[:1], rtol=2e-3, atol=1e-4)
+    interpolation = parts_at(Budget(interpolation_px=np.sqrt(3.0)), sight, *place, height, slopes=slopes).interpolation
+    np.testing.assert_allclose(interpolation, by_map[1:].sum(axis=0)[None], rtol=2e-3, atol=1e-4)
+    path = tmp_path / "accuracy.tif"
+    write_accuracy(Budget(heights=1.0), sight, dem, (128, 128), path, heights=(height.min(), height.max()), step=1)
+    found = gdal.Open(str(path)).ReadAsArray()[:2, 77, 41]
+    np.testing.assert_allclose(found, np.sqrt(by_map[0, :2]), rtol=2e-3, atol=1e-4)
+
+
+def test_ground_that_a_ray_grazes_has_a_large_error_and_no_infinite_one():
+    sight = Sight(Parallel(0.5, 0.0, 2.0, 256.0), City(()).grid())
+    place = [np.array([value]) for value in (200.0, 300.0, FLOOR)]
+    level, *steep = (
+        parts_at(Budget(heights=1.0), sight, *place, slopes=np.array([[slope, 0.1]])).heights[0, 0]
+        for slope in (0.0, 1.6, 2.0, 30.0)
+    )
+    np.testing.assert_allclose(np.array(steep) / level, 25.0, rtol=1e-5)
 
 
 def test_the_same_error_everywhere_is_that_of_the_scene(tmp_path):

@@ -84,8 +84,10 @@ def test_a_model_file_knows_how_good_its_parameters_were(tiny, points, tmp_path)
 def test_what_a_vendor_states_stands_for_a_model_that_nobody_adjusted(tiny, tmp_path):
     stated = write_rpc(tiny, tmp_path, err_bias=6.0, err_rand=2.5)
     result = rectified(tiny, tmp_path / "out", scene=stated, sigma=0.01)
-    # 6.5 m on either axis, whatever the place.
-    np.testing.assert_allclose(ce90(result)[np.isfinite(ce90(result))], 6.5 * math.sqrt(2 * math.log(10)), rtol=1e-3)
+    # 6.5 m on either axis on level ground; slopes of up to 0.067 change it by up to 2.4 %, as rays lean by 0.36.
+    made, level = ce90(result)[np.isfinite(ce90(result))], 6.5 * math.sqrt(2 * math.log(10))
+    np.testing.assert_allclose(made, level, rtol=0.025)
+    np.testing.assert_allclose(made.mean(), level, rtol=2e-3)
     found = read_report(result.files["report"]).accuracy
     assert max(found.shares, key=found.shares.__getitem__) == "model"
     assert any("vendor" in one for one in found.assumptions)

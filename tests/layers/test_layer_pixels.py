@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
-from blocks import FLOOR, NORTH, WEST, ZONE
+from blocks import FLOOR, NORTH, WEST, ZONE, slopes_of
 from osgeo import gdal
 from scipy.optimize import brentq
 
@@ -120,9 +120,9 @@ class Scene:
         heights = self.surface.heights(xy, UTM)
         assert isinstance(self.budget.heights, Surface)
         sigma = self.budget.heights.heights(xy, UTM)
-        image = self.sight.image(columns, rows, heights)
+        image, slopes = self.sight.image(columns, rows, heights), slopes_of(self.surface, self.sight, columns, rows)
         shown = np.asarray((image >= 0).all(axis=1) & (image <= self.size).all(axis=1))
-        parts = parts_at(self.budget, self.sight, columns, rows, heights, sigma)
+        parts = parts_at(self.budget, self.sight, columns, rows, heights, sigma, slopes)
         return parts, shown, shown & np.isfinite(sigma)
 
 
@@ -233,7 +233,7 @@ def test_a_scene_that_shows_nothing_has_no_figures(tmp_path: Path) -> None:
 def test_an_error_that_is_the_same_in_all_directions_has_the_radius_of_a_circle(
     tmp_path: Path, budget: Budget, sigma: float, rho: float, ce90: float
 ) -> None:
-    sight, surface = Sight(Leaning(), GRID), plane(tmp_path / "dem.tif", FLOOR - 1.0, 0.003, 0.002)
+    sight, surface = Sight(Leaning(), GRID), plane(tmp_path / "dem.tif", FLOOR - 1.0, 0.0, 0.0)
     layer = Scene(budget, sight, surface, (110, 105)).layer()
     found = assembled(layer, 200)
     shown = np.isfinite(found[0])

@@ -98,7 +98,10 @@ def compared(crs: str, place: tuple[float, float], folder, hills: Hills, dem: Su
     normal = np.einsum("nij,nj->ni", frame, np.cross(ends[0] - ends[1], ends[2] - ends[3]))
     cosine = normal @ towards(90 - SUN.elevation_deg, SUN.azimuth_deg) / np.linalg.norm(normal, axis=1)
     ce90 = read(folder / "c.tif")[3, rows[seen], columns[seen]]
-    off = np.abs(ce90 / radius_of(model.ellipse(at, COVARIANCE, SIGMA_H)) - 1)
+    covariance, rising = model.ellipse(at, COVARIANCE, SIGMA_H, -normal[:, :2] / normal[:, 2:])
+    open_to_view = rising > 0.25
+    assert open_to_view.mean() > 0.9
+    off = np.abs(ce90 / radius_of(covariance) - 1)[open_to_view]
 
     columns, rows = random.integers(0, SIDE, (2, 3000))
     dark = hills.shaded(lonlat(columns + 0.5, rows + 0.5), towards(90 - SUN.elevation_deg, SUN.azimuth_deg))

@@ -2,20 +2,25 @@ r"""How accurate each pixel of an ortho is: the covariance of where it shows the
 
 A pixel takes its height h from the surface and its value from the image point that the model gives. With the
 derivatives of `sight` in metres true east and north on the ground, :math:`A` (pixels per metre, at constant height) and
-:math:`d` (metres that ground moves per metre of height), the covariance of the place that it really shows is
+:math:`d` (metres that ground moves per metre of height), and the slope :math:`s` of the surface (rise per metre east
+and north), the covariance of the place that it really shows is
 
 .. math::
-    C = A^{-1} (J C_p J^T + \tfrac{1}{3} \beta^2 I) A^{-T} + (\sigma_h^2 + \sigma_0^2)\, d d^T + \sigma_r^2 I
+    C &= T (A^{-1} (J C_p J^T + \tfrac{1}{3} \beta^2 I) A^{-T} + (\sigma_h^2 + \sigma_0^2) d d^T + \sigma_r^2 I) T^T \\
+    T &= (I + d s^T)^{-1} = I - d s^T / (1 + s \cdot d)
 
 - :math:`J C_p J^T`: the parameters of the model as the points determine them, with what neighbouring points err
   together (`Fit.covariance`) and how little few points tell of their own errors (`predictive`); of a model that nobody
   adjusted :math:`\sigma^2 I` on the ground, as its vendor states;
 - :math:`\beta`: the bound of the warp's interpolation (px), taken as the limits of an even distribution;
 - :math:`\sigma_h, \sigma_0`: standard deviations of the heights and of their datum;
-- :math:`\sigma_r`: of the place of a reference that points were matched with, where :math:`C_p` does not have it.
+- :math:`\sigma_r`: of the place of a reference that points were matched with, where :math:`C_p` does not have it;
+- :math:`T`: a ray that is off meets a slope higher or lower. Errors are smaller on slopes that face the sensor, and
+  larger on those that turn away from it. Along the view the factor is :math:`1 / (1 + s \cdot d)`. Where a ray grazes
+  the ground it has no limit; it is taken for 1 / `LEAST` at most.
 
-Assumed is that these are independent, that the model follows the scene but for its parameters, and that the slope of
-the terrain is small against that of the ray. The parts are interpolated between nodes that are exact, to `_TOLERANCE`.
+Assumed is that the parts are independent, that the model follows the scene but for its parameters, and that the slope
+is even over the error. The parts are interpolated between nodes that are exact, to `_TOLERANCE`.
 """
 
 from __future__ import annotations
@@ -29,6 +34,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.geodesy.distortion import inverse_2x2
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
@@ -36,7 +42,7 @@ from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
 from ortho_pipeline.warp.quality import accuracy_kernel
-from ortho_pipeline.warp.quality.accuracy_kernel import Nodes, PixelHeights
+from ortho_pipeline.warp.quality.accuracy_kernel import LEAST, Nodes, PixelHeights
 from ortho_pipeline.warp.quality.error_ellipse import circular_error, circular_error_of_all, radii
 from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.tile_kernel import DemWindow
@@ -162,6 +168,7 @@ def parts_at(
     rows: Array,
     heights: Array,
     sigma_heights: Array | float | None = None,
+    slopes: Array | None = None,
 ) -> Parts:
     """Return what makes up the error of output positions ``(n,)`` (corner convention) at heights, exactly.
 
@@ -169,6 +176,8 @@ def parts_at(
     ----------
     sigma_heights : (n,) or float, optional
         Of the heights there; that of the budget without, if it is one number.
+    slopes : (n, 2), optional
+        Of the surface there: rise per metre true east and north. Without, it is level.
     """
     nodes = _exact(budget, sight, columns, rows, heights)
     if sigma_heights is None:
@@ -177,7 +186,13 @@ def parts_at(
     even = np.broadcast_to([budget.even, budget.even, 0.0], (len(columns), 3))
     east, north = nodes[:, 3], nodes[:, 4]
     height = np.stack([east**2, north**2, east * north], axis=1) * np.reshape(variance, (-1, 1))
-    return Parts(nodes[:, :3], height, even, nodes[:, 5:8])
+    parts = Parts(nodes[:, :3], height, even, nodes[:, 5:8])
+    if slopes is None:
+        return parts
+    along = (slopes * nodes[:, 3:5]).sum(axis=1, keepdims=True)
+    slopes = slopes * np.where(along < LEAST - 1.0, (LEAST - 1.0) / np.minimum(along, LEAST - 1.0), 1.0)
+    matrix = np.linalg.inv(np.eye(2) + nodes[:, 3:5, None] * slopes[:, None, :])
+    return Parts(*(_three(matrix @ _square(part) @ matrix.transpose(0, 2, 1)) for part in parts))
 
 
 def _exact(budget: Budget, sight: Sight, columns: Array, rows: Array, heights: Array) -> Array:
@@ -195,6 +210,10 @@ def _exact(budget: Budget, sight: Sight, columns: Array, rows: Array, heights: A
 
 def _three(covariance: Array) -> Array:
     return np.stack([covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]], axis=1)
+
+
+def _square(three: Array) -> Array:
+    return np.asarray(three[:, [0, 2, 2, 1]].reshape(-1, 2, 2))
 
 
 # -- everywhere ------------------------------------------------------------------------------------------------------
@@ -300,8 +319,11 @@ class _Layer:
 
     # -- nodes -------------------------------------------------------------------------------------------------------
 
-    def _nodes(self, left: int, top: int, width: int, height: int, spacing: int) -> tuple[Array, Array]:
-        """Return fields ``(rows, columns, levels, 10)`` of nodes, and their samples ``(rows, columns, 2, k)``."""
+    def _nodes(self, left: int, top: int, width: int, height: int, spacing: int) -> tuple[Array, Array, Array]:
+        """Return fields ``(rows, columns, levels, 10)`` of nodes, and their samples ``(rows, columns, 2, k)``.
+
+        Also return ``(rows, columns, 2, 2)`` pixels of column and row per metre true east and north.
+        """
         columns, rows = np.meshgrid(
             left + 0.5 + spacing * np.arange(-(-width // spacing) + 1),
             top + 0.5 + spacing * np.arange(-(-height // spacing) + 1),
@@ -310,7 +332,9 @@ class _Layer:
         x, y = self.sight.grid.xy(*flat)
         ground = np.stack([x, y, np.zeros(len(x))], axis=1)
         samples = np.stack([sampler(ground) for sampler in self.samplers], axis=2)
-        return self._polynomials(*flat).reshape(*shape, _LEVELS, -1), samples.reshape(*shape, 2, -1)
+        pixels = inverse_2x2(self.sight.metres(*flat, np.full(len(x), self.middle)))
+        fields = self._polynomials(*flat).reshape(*shape, _LEVELS, -1)
+        return fields, samples.reshape(*shape, 2, -1), pixels.reshape(*shape, 2, 2)
 
     def _polynomials(self, columns: Array, rows: Array) -> Array:
         """Return the fields at places as polynomials in the normalised height ``(n, levels, 10)``."""
@@ -367,7 +391,7 @@ class _Layer:
                     tile = bands[:, row : row + _EXACT_TILE, column : column + _EXACT_TILE]
                     self._fill(left + column, top + row, spacing, tile)
             return
-        nodes, samples = self._nodes(left, top, width, height, spacing)
+        nodes, samples, pixels = self._nodes(left, top, width, height, spacing)
         if spacing > 1 and not np.isfinite(nodes).all():
             # Where the model ends between nodes, every pixel is one.
             self._fill(left, top, 1, bands)
@@ -377,8 +401,8 @@ class _Layer:
             part = (slice(j, j + -(-nj // spacing) + 1), slice(i, i + -(-ni // spacing) + 1))
             here = (slice(row, row + nj), slice(column, column + ni))
             accuracy_kernel.fill(
-                Nodes(nodes[part], samples[part], spacing, self.middle, self.half),
-                self._heights(samples[part]),
+                Nodes(nodes[part], samples[part], pixels[part], spacing, self.middle, self.half),
+                self._heights(_with_rim(samples[part], spacing)),
                 self.budget.even,
                 (float(self.size[0]), float(self.size[1])),
                 radii(),
@@ -447,6 +471,14 @@ def _rounded(bands: NDArray[np.float32]) -> NDArray[np.float32]:
     bits += np.uint32(1 << 12)
     bits &= np.uint32(0xFFFFE000)
     return bands
+
+
+def _with_rim(samples: Array, spacing: int) -> Array:
+    """Return places about samples ``(rows, columns, 2, k)`` of nodes, half a pixel farther out, for slopes."""
+    steps = np.stack([samples[-1, 0] - samples[0, 0], samples[0, -1] - samples[0, 0]])
+    half = np.abs(steps) / (2 * spacing * np.reshape(np.subtract(samples.shape[:2], 1), (2, 1, 1)))
+    rim = np.nan_to_num(half.sum(axis=0))
+    return np.concatenate([samples - rim, samples + rim])
 
 
 def _window(surface: Surface, samples: Array) -> DemWindow:

@@ -11,6 +11,8 @@ from ortho_pipeline.warp.tile_kernel import DemWindow, dem_height_at
 
 #: Fields of a node: model (ee, nn, en), displacement (e, n), interpolation (ee, nn, en), image (column, row).
 _FIELDS = 10
+#: A ray grazes the ground if the way to it along the view grows by more than one over this.
+LEAST = 0.2
 
 
 class Nodes(NamedTuple):
@@ -22,12 +24,15 @@ class Nodes(NamedTuple):
         Quadratics in the normalised height, which is -1 at middle - half and 1 at middle + half (m).
     samples : (rows, columns, 2, k)
         Sample coordinates of the heights and of their standard deviations.
+    pixels : (rows, columns, 2, 2)
+        Pixels of column and row per metre true east and north.
     spacing : int
         Pixels from node to node.
     """
 
     fields: Any
     samples: Any
+    pixels: Any
     spacing: int
     middle: float
     half: float
@@ -54,7 +59,7 @@ def fill(lattice: Nodes, heights: PixelHeights, even: float, size: Any, radii: A
     begin, grow = np.empty((3, _FIELDS)), np.empty((3, _FIELDS))
     place, way = np.empty(samples.shape[2:]), np.empty(samples.shape[2:])
     values, ticks, scaled = np.empty((_FIELDS, spacing)), np.arange(spacing) / spacing, np.empty(spacing)
-    variances, ellipses = np.zeros(spacing), np.empty((5, spacing))
+    variances, slopes, ellipses = np.zeros(spacing), np.empty((2, spacing)), np.empty((5, spacing))
     for row in range(height):
         j, fy = row // spacing, (row % spacing) / spacing
         for i in range((width - 1) // spacing + 1):
@@ -68,13 +73,14 @@ def fill(lattice: Nodes, heights: PixelHeights, even: float, size: Any, radii: A
             for f in range(_FIELDS):
                 _quadratic(begin, grow, f, ticks, scaled, values[f], count)
             _height_variances(heights, place, way, ticks, variances, count)
-            _ellipses(values, variances, even, ellipses, count)
+            _slopes(lattice, heights.dem, j, i, place, way, ticks, slopes, count)
+            _ellipses(values, variances, slopes, even, ellipses, count)
             for c in range(count):
                 if 0.0 <= values[8, c] <= size[0] and 0.0 <= values[9, c] <= size[1]:
                     totals[7] += 1.0
                     if ellipses[0, c] + ellipses[1, c] + ellipses[2, c] < np.inf:
                         _put(ellipses, c, radii, bands, row, first + c)
-                        _count(values, c, variances[c], even, totals)
+                        _count(values, c, variances[c], slopes, even, ellipses, totals)
 
 
 @inlined
@@ -119,13 +125,48 @@ def _height_variances(heights, place, way, ticks, out, count):
 
 
 @inlined
-def _ellipses(values, variances, even, out, count):
-    """Fill ee, nn, en, the larger half axis and the smaller in parts of it, of a row of a cell; without a branch."""
+def _slopes(lattice, dem, j, i, place, way, ticks, out, count):
+    """Fill the rise per metre east and north over each pixel of a row of a cell; 0 where a height is missing."""
+    samples, pixels = lattice.samples, lattice.pixels[j, i]
+    here, east, south, parts = samples[j, i], samples[j, i + 1], samples[j + 1, i], 2 * lattice.spacing
+    across_u, across_v = (east[0, 0] - here[0, 0]) / parts, (east[1, 0] - here[1, 0]) / parts
+    down_u, down_v = (south[0, 0] - here[0, 0]) / parts, (south[1, 0] - here[1, 0]) / parts
+    for c in range(count):
+        u, v = place[0, 0] + way[0, 0] * ticks[c], place[1, 0] + way[1, 0] * ticks[c]
+        across = dem_height_at(dem.heights, u + across_u, v + across_v, dem.left, dem.top, False)
+        across -= dem_height_at(dem.heights, u - across_u, v - across_v, dem.left, dem.top, False)
+        down = dem_height_at(dem.heights, u + down_u, v + down_v, dem.left, dem.top, False)
+        down -= dem_height_at(dem.heights, u - down_u, v - down_v, dem.left, dem.top, False)
+        to_east, to_north = across * pixels[0, 0] + down * pixels[1, 0], across * pixels[0, 1] + down * pixels[1, 1]
+        known = to_east + to_north < np.inf
+        out[0, c], out[1, c] = to_east if known else 0.0, to_north if known else 0.0
+
+
+@inlined
+def _turned(values, slopes, c):
+    """Return how an error on level ground is one on a slope: a matrix, row by row."""
+    east, north, to_east, to_north = values[3, c], values[4, c], slopes[0, c], slopes[1, c]
+    along = to_east * east + to_north * north
+    limited = max(along, LEAST - 1.0)
+    factor = (limited / along if limited > along else 1.0) / (1.0 + limited)
+    return (
+        1.0 - east * to_east * factor, -east * to_north * factor,
+        -north * to_east * factor, 1.0 - north * to_north * factor,
+    )  # fmt: skip
+
+
+@inlined
+def _ellipses(values, variances, slopes, even, out, count):
+    """Fill ee, nn, en, the larger half axis and the smaller in parts of it, of a row of a cell."""
     for c in range(count):
         east, north, variance = values[3, c], values[4, c], variances[c]
-        ee = values[0, c] + east * east * variance + even + values[5, c]
-        nn = values[1, c] + north * north * variance + even + values[6, c]
-        en = values[2, c] + east * north * variance + values[7, c]
+        level_ee = values[0, c] + east * east * variance + even + values[5, c]
+        level_nn = values[1, c] + north * north * variance + even + values[6, c]
+        level_en = values[2, c] + east * north * variance + values[7, c]
+        a, b, g, h = _turned(values, slopes, c)
+        ee = a * a * level_ee + 2.0 * a * b * level_en + b * b * level_nn
+        nn = g * g * level_ee + 2.0 * g * h * level_en + h * h * level_nn
+        en = a * g * level_ee + (a * h + b * g) * level_en + b * h * level_nn
         middle, half = 0.5 * (ee + nn), np.sqrt(0.25 * (ee - nn) * (ee - nn) + en * en)
         large = middle + half
         out[0, c], out[1, c], out[2, c] = ee, nn, en
@@ -145,15 +186,17 @@ def _put(ellipses, c, radii, bands, row, column):
 
 
 @inlined
-def _count(values, c, variance, even, totals):
+def _count(values, c, variance, slopes, even, ellipses, totals):
     """Count the variances of a pixel into what all come to together."""
-    east, north = values[3, c] * values[3, c] * variance, values[4, c] * values[4, c] * variance
-    totals[0] += values[0, c] + values[1, c]
-    totals[1] += east + north
-    totals[2] += 2.0 * even
-    totals[3] += values[5, c] + values[6, c]
-    totals[4] += values[0, c] + east + even + values[5, c]
-    totals[5] += values[1, c] + north + even + values[6, c]
+    a, b, g, h = _turned(values, slopes, c)
+    of_ee, of_nn, of_en = a * a + g * g, b * b + h * h, 2.0 * (a * b + g * h)
+    east, north = values[3, c], values[4, c]
+    totals[0] += of_ee * values[0, c] + of_nn * values[1, c] + of_en * values[2, c]
+    totals[1] += (of_ee * east * east + of_nn * north * north + of_en * east * north) * variance
+    totals[2] += (of_ee + of_nn) * even
+    totals[3] += of_ee * values[5, c] + of_nn * values[6, c] + of_en * values[7, c]
+    totals[4] += ellipses[0, c]
+    totals[5] += ellipses[1, c]
     totals[6] += 1.0
 
 
