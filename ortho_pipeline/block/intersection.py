@@ -2,7 +2,8 @@ r"""Forward intersection: the ground point that the rays of several images meet 
 
 For each point alone the sum of squares of :math:`(l_i - f_i(X)) / \sigma_i` over its rays is minimised, all points side
 by side. The covariance of a point is :math:`\sigma_0^2 (B^T B)^{-1}` with the weighted partials :math:`B` of its rays;
-errors of the models themselves are not in it (they are in that of an adjustment).
+errors of the models themselves are not in it (they are in that of an adjustment). With a redundancy below 4, rays can
+meet by chance: stated sigmas hold.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ortho_pipeline.block.projection.rays import linearised
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.observations.arguments import refuse_other_model, refuse_other_points
+from ortho_pipeline.estimation.problem import LEAST_REDUNDANCY
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 
@@ -88,7 +90,7 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     models : mapping of image name to SensorModel
         One for each image of the points.
     scaled : bool
-        Scale covariances by the estimated sigma0² (of all points together), not by 1.
+        Scale covariances by the estimated sigma0² of all points together, if their redundancy is at least 4.
 
     Raises
     ------
@@ -128,7 +130,7 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     covariance = axes @ covariance @ axes.swapaxes(1, 2)
     rows = np.zeros((points.rays, 2, 3))
     rows[rays] = partials
-    if scaled and sigma0 is not None:
+    if scaled and sigma0 is not None and freedom >= LEAST_REDUNDANCY:
         covariance *= sigma0**2
     # Along a ray the image does not change: it is across both rows of the partials.
     directions = np.where(found[points.point, None], np.cross(rows[:, 0], rows[:, 1]), np.nan)

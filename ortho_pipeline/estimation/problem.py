@@ -51,8 +51,8 @@ INDISPENSABLE = 1e-9
 SCALE_FLOOR = 1e-3
 #: sigma0 is settled if it changes by less than this part.
 _SETTLED, _ROUNDS = 1e-3, 30
-#: With priors and a smaller redundancy, points can fit by chance, and priors would no longer count.
-_FEWEST = 4.0
+#: With a smaller redundancy, observations can fit by chance: stated sigmas hold, or priors would no longer count.
+LEAST_REDUNDANCY = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ class Problem:
             return solution
         scale = 1.0
         for _ in range(_ROUNDS):
-            if solution.sigma0 is None or solution.freedom < _FEWEST:
+            if solution.sigma0 is None or solution.freedom < LEAST_REDUNDANCY:
                 return replace(stated, sigma0=None)
             last, scale = scale, max(solution.sigma0, SCALE_FLOOR)
             if abs(scale - last) <= _SETTLED * last:

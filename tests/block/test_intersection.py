@@ -123,6 +123,15 @@ def test_the_angle_between_rays_is_that_of_their_displacements() -> None:
     np.testing.assert_allclose(intersect(MODELS, block(drop=[3, 4, 5])).angles_deg, angles[1], rtol=1e-3)
 
 
+def test_few_rays_that_meet_by_chance_keep_their_stated_sigmas() -> None:
+    """Three points in two images have a redundancy of 3: their sigma0 says little."""
+    points = block(noise=0.05, drop=[0, 1, 2])
+    found, stated = intersect(MODELS, points), intersect(MODELS, points, scaled=False)
+    assert found.sigma0 is not None
+    assert found.sigma0 < 0.2
+    np.testing.assert_array_equal(found.covariance, stated.covariance)
+
+
 def test_two_rays_have_no_redundancy_left_for_a_sigma() -> None:
     found = intersect(MODELS, block(drop=[0, 1, 2]))
     assert found.sigma0 is not None, "four equations for three unknowns"
