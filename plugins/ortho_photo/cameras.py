@@ -55,6 +55,8 @@ CALIBRATED = {
     "p2": 1e-3,
 }
 NOMINAL = {"focal_length": 0.02, "x0": 0.005, "y0": 0.005, "k1": 0.03, "k2": 0.02, "k3": 0.01, "p1": 1e-3, "p2": 1e-3}
+#: Whole millimetres, which makers round further: cameras of known sensors differ by up to 3 %.
+FILM = NOMINAL | {"focal_length": 0.03}
 _PIXEL = 1e-6
 _NO_CROPS = "give the whole photo; crops are not supported"
 _REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs/formats/frame.md)"
@@ -223,7 +225,7 @@ def _of_film(tags: Tags, width: int, height: int) -> PhotoCamera | None:
         return None
     longer = max(width, height)
     pixels = film / _FILM_MM * math.hypot(longer, max(min(width, height), longer / _FILM_SHAPE))
-    return PhotoCamera(_plain(width, height, pixels), "focal length in 35 mm film, rounded")
+    return PhotoCamera(_plain(width, height, pixels), "focal length in 35 mm film, rounded", FILM)
 
 
 def _dewarped(tags: Tags, width: int, height: int, full: float) -> PhotoCamera | None:

@@ -286,7 +286,8 @@ def test_photos_share_the_camera_with_sigmas_of_its_source(tmp_path):
     nominal = opened(photo(tmp_path / "a.tif"), calibrate="yes")
     calibrated = opened(photo(tmp_path / "b.tif", xmp={**DJI, "drone-dji:DewarpData": data}), calibrate="yes")
     lens = ("focal_length", "x0", "y0", "k1", "k2", "k3", "p1", "p2")
-    for scene, focal, k1 in ((nominal, 0.02, 0.03), (calibrated, 0.005, 0.01)):
+    film = opened(photo(tmp_path / "film.tif", EXIF | {"Model": "X"}), calibrate="yes")
+    for scene, focal, k1 in ((nominal, 0.02, 0.03), (film, 0.03, 0.03), (calibrated, 0.005, 0.01)):
         assert scene.model.param_names[6:] == lens
         assert all(bool(scene.priors[name].shared) == (name in lens) for name in scene.model.param_names)
         assert scene.priors["focal_length"].sigma == pytest.approx(focal * scene.model.interior.focal_length)
