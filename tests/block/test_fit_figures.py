@@ -64,7 +64,8 @@ def test_root_mean_squares_of_an_image_are_over_what_was_used(fit: BlockFit, whi
         sizes.append(found.n)
         assert getattr(getattr(fit.record.images[image].rms, which), role) == found
     assert sum(sizes) < (points.roles[points.point] == role).sum()
-    assert fit.image_rms("i0", "nobody") is None
+    with pytest.raises(InputError, match="no role 'nobody'"):
+        fit.image_rms("i0", "nobody")
     with pytest.raises(InputError, match="no residuals 'other'"):
         fit.image_rms("i0", role, "other")
 
