@@ -32,6 +32,8 @@ _AHEAD = 256
 _TOGETHER, _MOST_TOGETHER = 3.0, 64
 #: So long a scheduler may take to answer.
 _PATIENCE = "5s"
+#: Seconds in which processes that are ended remove their temporary files; then they are killed.
+_LEAVE = 10.0
 #: Environment variables that bound the threads of numerical libraries.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -122,9 +124,12 @@ class Processes:
         for process in self._spawned:
             with contextlib.suppress(ValueError):
                 process.terminate()
+        until = time.monotonic() + _LEAVE
         for process in self._spawned:
             with contextlib.suppress(ValueError):
-                process.join(10)
+                process.join(max(0.0, until - time.monotonic()))
+                # A signal reaches a job only between two calls of compiled code.
+                process.kill()
         self._spawned.clear()
 
 

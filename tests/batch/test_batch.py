@@ -769,6 +769,20 @@ def test_processes_that_are_ended_remove_their_temporary_files(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_processes_that_do_not_end_are_killed(monkeypatch):
+    """A signal does not reach a job within a call of compiled code, and the run would wait for the end of this call."""
+    monkeypatch.setattr("ortho_pipeline.batch.executors._LEAVE", 0.1)
+    crew = Processes(1, 1)
+    pairs = completed(crew, exec, ["pass", "sum(range(10**10))"])
+    next(pairs)
+    processes = list(crew._spawned)
+    time.sleep(0.1)
+    pairs.close()  # as an interrupt does
+    for process in processes:
+        process.join(3)
+        assert not process.is_alive()
+
+
 def test_what_a_killed_process_left_is_removed(block):
     begun = (
         "import os, sys; from ortho_pipeline.files import *\n"
