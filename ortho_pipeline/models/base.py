@@ -213,7 +213,7 @@ class SensorModel(ABC):
                 # A step of 1e-9 suits an angle in radians. A position in metres has rounding errors of that size.
                 if reach < _MOVED[0] and step < 0.01 * max(abs(value), 1.0):
                     step *= 100
-                elif reach > _MOVED[1]:
+                elif reach > _MOVED[1] and step > 1e-8 * max(abs(value), 1.0):  # not without end at a seam of the image
                     step /= 100
                 else:
                     break

@@ -283,3 +283,18 @@ def test_slopes_of_parameters_are_right_in_any_unit_and_at_zero(value, monkeypat
     assert model.param_partials(ground[:0]).shape == (0, 2, 2)
     monkeypatch.setitem(KINDS, Shifted.kind, Shifted)
     check_sensor_model(Shifted(), ground)
+
+
+def test_a_point_at_a_seam_of_the_image_does_not_spoil_the_slopes_of_others(monkeypatch):
+    """It moves far with any step."""
+    plain, model, ground = Shifted.ground_to_image, Shifted((30.0, 30.0)), box_of(Shifted(), 20)
+    seam = plain(model, ground[:1])[0, 0]
+
+    def wrapped(self, ground):
+        image = plain(self, ground)
+        image[image[:, 0] > seam, 0] += 1000.0
+        return image
+
+    monkeypatch.setattr(Shifted, "ground_to_image", wrapped)
+    partials = model.param_partials(ground)
+    np.testing.assert_allclose(partials[1:], np.broadcast_to(np.eye(2) / 10, (19, 2, 2)), atol=1e-3)
