@@ -159,9 +159,12 @@ class Pansharpened:
         left, top, width, height = window
         factor = max(self.overlap.ratio, 1)
         pan = self._read(sharp, window)[0]
-        coarse = left / factor, top / factor, width / factor, height / factor
-        colours = self._read(wide, coarse, (width, height)) if factor > 1 else self._read(wide, window)
-        colours = colours[: self._colours.count]
+        # GDAL's bindings read whole pixels.
+        first, upper = left // factor, top // factor
+        columns, rows = -(-(left + width) // factor) - first, -(-(top + height) // factor) - upper
+        colours = self._read(wide, (first, upper, columns, rows), factor)
+        inset = slice(top - upper * factor, None), slice(left - first * factor, None)
+        colours = colours[: self._colours.count, *inset][:, :height, :width]
         valid = (pan != _EMPTY) & (colours != _EMPTY).all(axis=0)
         colours = within(colours, self._colours.dtype)
         if self._native and colours.dtype != self._colours.dtype:
@@ -178,18 +181,15 @@ class Pansharpened:
             keep_off_nodata(out, np.broadcast_to(valid, out.shape), fill, low)
         return out
 
-    def _read(
-        self, dataset: gdal.Dataset, window: tuple[float, float, float, float], size: tuple[int, int] = (0, 0)
-    ) -> NDArray[Any]:
-        """Return a window, upsampled to a size if one is given."""
-        larger = {"buf_xsize": size[0], "buf_ysize": size[1], "resample_alg": gdal.GRIORA_Cubic} if any(size) else {}
+    def _read(self, dataset: gdal.Dataset, window: tuple[int, int, int, int], factor: int = 1) -> NDArray[Any]:
+        """Return a window, upsampled by a factor."""
+        columns, rows = window[2] * factor, window[3] * factor
         try:
-            pixels = dataset.ReadAsArray(*window, **larger)
+            pixels = dataset.ReadAsArray(*window, buf_xsize=columns, buf_ysize=rows, resample_alg=gdal.GRIORA_Cubic)
         except RuntimeError as error:
             raise InputError(
                 f"GDAL cannot sharpen this ortho ({first_line(error)})", file=self._pan.path, remedy="make it again"
             ) from error
-        rows, columns = np.asarray(pixels).shape[-2:]
         return np.asarray(pixels).reshape(-1, rows, columns)
 
     def _all_valid(self, left: int, top: int, width: int, height: int) -> bool:

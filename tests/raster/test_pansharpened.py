@@ -217,6 +217,25 @@ def test_dark_pixels_next_to_bright_ones_are_the_same_where_others_are_empty(tmp
     assert np.abs(found.astype(int) - expected)[:, 4:].max() <= 2
 
 
+@pytest.mark.parametrize("window", [(0, 0, 126, 126), (125, 0, 1, 126), (3, 5, 2, 121), (100, 100, 26, 26)])
+def test_any_window_of_a_masked_ortho_has_the_pixels_of_the_whole(
+    tmp_path: Path, window: tuple[int, int, int, int]
+) -> None:
+    """The area begins in the middle of a multispectral pixel, and windows are parts of such pixels."""
+    random = np.random.default_rng(2)
+    sharp, wide = (random.integers(100, 900, size).astype(np.uint16) for size in ((1, 126, 126), (2, 32, 32)))
+    sharp[0, 60, 60] = 7
+    pan = write(tmp_path / "p.tif", place(2, 2, 126, 126), sharp, 7)
+    colours = write(tmp_path / "c.tif", place(0, 0, 32, 32, RATIO), wide, 9)
+    smooth = np.floor(np.clip(upsampled(wide.astype(np.float32), 128, 128)[:, 2:, 2:], 0, None) + 0.5)
+    expected = np.clip(brovey(sharp[0].astype(float), smooth, WEIGHTS), 0, 65535)
+    left, top, width, height = window
+    here = slice(top, top + height), slice(left, left + width)
+    found, valid = opened(pan, colours).read(*window)
+    np.testing.assert_array_equal(valid, sharp[0][here] != 7)
+    np.testing.assert_allclose(found[:, valid], expected[:, *here][:, valid], atol=0.51, rtol=1e-5)
+
+
 def test_a_plane_stays_a_plane_when_it_is_upsampled() -> None:
     """Positions are those of the middles of pixels. The middle of a hole has no value, and no number comes from it."""
     rows, columns = np.mgrid[0:10, 0:15] + 0.5
