@@ -25,10 +25,9 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from osgeo import gdal, gdal_array
+from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
@@ -38,6 +37,7 @@ from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
+from ortho_pipeline.raster.pixel_types import gdal_type
 from ortho_pipeline.raster.source import Grid, first_line
 from ortho_pipeline.raster.verified_writing import gdal_errors, written
 from ortho_pipeline.surface.base import Excerpt, Surface
@@ -362,7 +362,7 @@ def _create(path: Path, profile: Profile, grid: Grid) -> gdal.Dataset:
         grid.width,
         grid.height,
         profile.count + mask,
-        _gdal_type(profile.dtype),
+        gdal_type(profile.dtype),
         ["TILED=YES", "BIGTIFF=IF_SAFER"],
     )
 
@@ -374,10 +374,6 @@ def _describe(dataset: gdal.Dataset, profile: Profile) -> None:
     if profile.nodata is not None:
         for k in range(profile.count):
             dataset.GetRasterBand(k + 1).SetNoDataValue(profile.nodata)
-
-
-def _gdal_type(dtype: np.dtype[Any]) -> int:
-    return int(gdal_array.NumericTypeCodeToGDALTypeCode(dtype.type))
 
 
 def _warp_exactly(
@@ -395,7 +391,7 @@ def _warp_exactly(
         errorThreshold=0,
         resampleAlg=job.resampling,
         # By itself the warper clamps the source to the type of the output before it interpolates.
-        workingType=_gdal_type(job.source.dtype),
+        workingType=gdal_type(job.source.dtype),
         dstNodata=profile.nodata,
         multithread=threads > 1,
         warpMemoryLimit=job.resources.memory // 2,
