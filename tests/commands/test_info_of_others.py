@@ -80,6 +80,19 @@ def test_a_dem_of_voids_is_described(tmp_path: Path):
     assert done.exit_code == 0
 
 
+def test_a_damaged_dem_is_not_one_of_voids(tmp_path: Path):
+    path = tmp_path / "dem.tif"
+    made = gdal.Translate(str(path), str(SAMPLE / "dem.tif"), creationOptions=["COMPRESS=DEFLATE"])
+    begins = int(made.GetRasterBand(1).GetMetadataItem("BLOCK_OFFSET_0_0", "TIFF"))
+    made = None
+    content = bytearray(path.read_bytes())
+    content[begins : begins + 8] = b"\xff" * 8
+    path.write_bytes(content)
+    done = info(path)
+    assert "the heights cannot be read" in done.output
+    assert done.exit_code == 2
+
+
 def test_a_dem_without_a_datum_asks_for_it(tmp_path):
     dem = str(tmp_path / "dem.tif")
     gdal.Translate(dem, str(SAMPLE / "dem.tif"), outputSRS="EPSG:32636")

@@ -10,6 +10,7 @@ import pyproj
 
 from ortho_pipeline.commands.results import SCHEMA_VERSION
 from ortho_pipeline.display.notices import to_document
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
@@ -41,7 +42,7 @@ def described(image: str | os.PathLike[str], dataset: Any) -> dict[str, Any]:
     corners = pixels @ [[along_x, along_y], [over_x, over_y]] + (left, top)
     lon_lat = ground_transform(horizontal(crs), "EPSG:4979")(np.column_stack([corners, np.zeros(4)]))[:, :2]
     declared = declared_vertical(crs)
-    heights = _range_of(band) if kind == "dem" else None
+    heights = _range_of(band, str(image)) if kind == "dem" else None
     return {
         "schema_version": SCHEMA_VERSION,
         "image": str(image),
@@ -63,12 +64,20 @@ def described(image: str | os.PathLike[str], dataset: Any) -> dict[str, Any]:
     }
 
 
-def _range_of(band: Any) -> list[float] | None:
+def _range_of(band: Any, path: str) -> list[float] | None:
     """Return the lowest and the highest height about, in the unit of the band; None if no valid sample was found."""
+    from ortho_pipeline.raster.source import first_line
+
     try:
         ends = np.array(band.ComputeRasterMinMax(True))
-    except RuntimeError:
-        return None
+    except RuntimeError as error:
+        if "no valid pixels" in str(error):
+            return None
+        raise InputError(
+            f"the heights cannot be read ({first_line(error, path)})",
+            file=path,
+            remedy="the file is damaged: copy it again",
+        ) from error
     scale = 1.0 if band.GetScale() is None else band.GetScale()
     return sorted((ends * scale + (band.GetOffset() or 0.0)).tolist())
 
