@@ -128,6 +128,13 @@ def test_sidecars_that_are_texts_may_not_be_links_elsewhere(tmp_path: Path, name
     assert opened(path)[0].RasterXSize == 300
 
 
+@pytest.mark.parametrize("text", ["", "\n", "\0" * 100])
+def test_an_empty_sidecar_is_ignored_as_gdal_does(tmp_path: Path, text: str) -> None:
+    path = tiff(tmp_path / "in.tif")
+    (tmp_path / "in.tif.aux.xml").write_text(text)
+    assert opened(path)[0].RasterXSize == 300
+
+
 def test_overviews_named_in_metadata_are_seen_to(tmp_path: Path) -> None:
     tiff(tmp_path / "b" / "half.tif", size=(150, 100))
     path = tiff(tmp_path / "a" / "in.tif")

@@ -84,7 +84,8 @@ def _header(path: Any, limit: int = _MAX_HEADER) -> str:
 def _xml(path: Any) -> Any:
     """Return XML as GDAL understands it: nodes ``[kind, name, *children]``, whether well-formed or not."""
     try:
-        return gdal.ParseXMLString(_header(path))
+        # Of an empty file it is None. An interrupted program leaves such side-cars, and GDAL ignores them.
+        return gdal.ParseXMLString(_header(path)) or [_ELEMENT, ""]
     except (RuntimeError, UnicodeDecodeError) as error:
         raise InputError(
             f"this is not well-formed XML ({str(error).strip()})", file=path, remedy="copy the file again"
