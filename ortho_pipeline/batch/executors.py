@@ -121,16 +121,25 @@ class Processes:
         """End all processes; unfinished scenes have no outputs, and remove their temporary files."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in self._spawned:
+        started = [process for process in self._spawned if _is_started(process)]
+        for process in started:
             with contextlib.suppress(ValueError):
                 process.terminate()
         until = time.monotonic() + _LEAVE
-        for process in self._spawned:
+        for process in started:
             with contextlib.suppress(ValueError):
                 process.join(max(0.0, until - time.monotonic()))
                 # A signal reaches a job only between two calls of compiled code.
                 process.kill()
         self._spawned.clear()
+
+
+def _is_started(process: SpawnProcess) -> bool:
+    """Return whether a process was started and is not closed."""
+    try:
+        return process.pid is not None
+    except ValueError:
+        return False
 
 
 class InGroups:
@@ -374,8 +383,12 @@ def _died(future: Future[Outcome]) -> Future[Outcome]:
     failed: Future[Outcome] = Future()
     failed.set_exception(
         WorkerDied(
-            "the process of this scene was killed",
-            remedy=Text("give it more memory, or ", Setting("workers", "1")),
+            "a worker process ended before its work was done",
+            remedy=Text(
+                "give it more memory, or ",
+                Setting("workers", "1"),
+                '; in a Python script, put the call below the line if __name__ == "__main__":',
+            ),
         )
     )
     return failed
