@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.batch.stack.placing import Placed
+from ortho_pipeline.block.stack.adjustment import AdjustedStack
+from ortho_pipeline.block.stack.edges import Cells
 from ortho_pipeline.commands.orthos.opening import ORTHO
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import MapGrid
@@ -28,3 +34,15 @@ def test_the_area_of_a_stack_is_what_matched_dates_share() -> None:
     assert high.tolist() == [west + 250.0, north + 240.0]
     # A reference may show all of a date.
     assert Placed.of(dates[:1]).shared(dates[:1], [(0, 1)])[1].tolist() == [240.0, 240.0]
+
+
+def test_dates_that_are_not_corrected_do_not_extend_the_grid() -> None:
+    """An ortho of another place, 300 km away, would make all orthos 300 km large."""
+    dates = [date(300_000, 240), date(0, 240), date(10, 240)]
+    placed, corrected = Placed.of(dates), np.array([False, True, True])
+    parts: dict[str, Any] = {one.name: None for one in fields(AdjustedStack)}
+    stack = AdjustedStack(**parts | {"cells": Cells.over(*placed.shared(dates, [(2, 1)])), "determined": corrected})
+    found, same = placed.of_corrected(dates, stack)
+    assert (found.grid.left, found.grid.width, found.grid.height) == (500_000.0, 250, 240)
+    before, after = (one.model.image_to_ground(of.cells.middles, 0.0) for one, of in ((placed, stack), (found, same)))
+    np.testing.assert_allclose(after, before, atol=1e-6)

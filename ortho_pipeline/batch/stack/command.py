@@ -289,6 +289,7 @@ def _made(planned: _Planned, crew: Crew) -> StackResult:
     dates = nodes[: planned.count]
     placed = Placed.of(dates)
     solved = _adjusted(nodes, dates, placed, pairs, planned.fixed, not options.shift_only)
+    placed, solved = placed.of_corrected(dates, solved)
     aligned = planned.part(_ALIGNED)
     writer = Writer(aligned, placed, scene, planned.output, options.corrections_only)
     names, outdated = writer.write(dates, solved, crew, lambda share: told("writing", share))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
@@ -20,13 +21,18 @@ from ortho_pipeline.surface.base import Surface
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """The grid of a stack: that of its first date, extended to all others."""
+    """The grid of a stack: that of its first date, extended to all that are corrected."""
 
     grid: Grid
 
     @classmethod
-    def of(cls, dates: Sequence[Dated]) -> Placed:
+    def of(cls, dates: Sequence[Dated], some: NDArray[np.bool_] | None = None) -> Placed:
         """Return the grid of orthos.
+
+        Parameters
+        ----------
+        some : (T,) of bool, optional
+            Dates whose area it has. Default: all.
 
         Raises
         ------
@@ -45,7 +51,8 @@ class Placed:
                 )
         first = models[0]
         step = np.array(first.pixel)
-        corners = np.concatenate([model.corners for model in models])
+        seen = np.ones(len(models), dtype=bool) if some is None else some
+        corners = np.concatenate([model.corners for model, is_seen in zip(models, seen, strict=True) if is_seen])
         origin = first.corners[:, 0].min(), first.corners[:, 1].max()
         before = np.ceil((origin[0] - corners[:, 0].min()) / step[0] - 1e-6)
         above = np.ceil((corners[:, 1].max() - origin[1]) / step[1] - 1e-6)
@@ -53,6 +60,14 @@ class Placed:
         width = int(np.ceil((corners[:, 0].max() - left) / step[0] - 1e-6))
         height = int(np.ceil((top - corners[:, 1].min()) / step[1] - 1e-6))
         return cls(Grid(crs, float(left), float(top), float(step[0]), float(step[1]), width, height))
+
+    def of_corrected(self, dates: Sequence[Dated], stack: AdjustedStack) -> tuple[Placed, AdjustedStack]:
+        """Return the grid without the area of dates that are not corrected, and the same stack on that grid."""
+        found = Placed.of(dates, stack.determined[: len(dates)])
+        old, new = self.grid, found.grid
+        # Both have the pixels of the first date.
+        moved = np.rint([(new.left - old.left) / old.dx, (old.top - new.top) / old.dy])
+        return found, replace(stack, cells=stack.cells._replace(low=stack.cells.low - moved))
 
     @property
     def model(self) -> MapGrid:
