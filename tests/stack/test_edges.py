@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from ortho_pipeline.batch.stack.document import closures
 from ortho_pipeline.block.stack.components import ErrorComponents
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.graph import pairs_of
@@ -198,3 +202,23 @@ def test_the_variance_of_a_value_is_the_sum_of_all_that_errs() -> None:
     np.testing.assert_allclose(made.of_seasons(np.array([0.7, 0.8])), [0.0, 0.0])
     less = ErrorComponents(shared, own, np.ones(3), np.ones(2), np.array([-0.4, 0.3]))
     np.testing.assert_allclose(less.of_seasons(np.array([0.8, 0.8])), [0.2, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("pairs", "loops"),
+    [
+        ([(1, 0), (2, 0), (2, 1)], 1),
+        ([(1, 0), (0, 2), (1, 2)], 1),  # 2 is a reference
+        ([(1, 0), (2, 0), (2, 1), (0, 3), (1, 3), (2, 3)], 4),
+        ([(1, 0), (2, 1), (3, 2), (3, 0)], 0),
+    ],
+)
+def test_loops_of_three_include_those_with_a_reference(pairs: list[tuple[int, int]], loops: int) -> None:
+    position = np.array([[0.0, 0.0], [1.0, 2.0], [-3.0, 1.0], [2.0, 2.0]])
+    first, second = np.array(pairs).T
+    shifts = position[first] - position[second]
+    shifts[0] += 0.3, 0.4
+    stack: Any = SimpleNamespace(edges=SimpleNamespace(first=first, second=second), determined=np.ones(4, dtype=bool))
+    found = closures(stack, shifts, np.ones(len(pairs), dtype=bool))
+    assert found.loops == loops
+    assert found.largest_px == (pytest.approx(0.5) if loops else None)

@@ -172,11 +172,12 @@ def _pairs(dates: Sequence[Dated], pairs: Sequence[DatePair], stack: AdjustedSta
 
 def closures(stack: AdjustedStack, shifts: Array, some: NDArray[np.bool_]) -> ClosureRecord:
     """Return the closing errors of loops of three of some edges ``(E,)``."""
-    edges = stack.edges
+    edges, nodes = stack.edges, len(stack.determined)
     number = {(int(a), int(b)): e for e, (a, b) in enumerate(zip(edges.first, edges.second, strict=True)) if some[e]}
     found = []
     for (one, other), edge in number.items():
-        for third in range(other):
+        # Dates have pairs with earlier ones; a reference, which is the last node, is the second of its pairs.
+        for third in range(nodes):
             back, long = number.get((other, third)), number.get((one, third))
             if back is not None and long is not None:
                 found.append(float(np.hypot(*(shifts[edge] + shifts[back] - shifts[long]))))
