@@ -51,6 +51,20 @@ def test_a_list_and_a_pattern_count_more_than_metadata(tmp_path):
     assert {one.source for one in found} == {"list"}
 
 
+def test_a_pattern_takes_images_and_no_sidecars(tmp_path):
+    for name in ("a_20200105", "a_20200301"):
+        ortho(tmp_path / f"{name}.tif")
+        (tmp_path / f"{name}.tfw").write_text("1\n0\n0\n-1\n500000.5\n6999999.5\n")
+        (tmp_path / f"{name}_RPC.TXT").write_text("LINE_OFF: 1\n")
+    with pytest.raises(InputError) as caught:
+        read_list(tmp_path / "a_20200105_RPC.TXT")
+    assert "give the folder of the images" in str(caught.value.remedy)
+    for name in ("a_20200105", "a_20200301"):
+        (tmp_path / f"{name}_RPC.TXT").rename(tmp_path / f"{name}.txt")
+    found = dated_orthos([tmp_path / "a_*"], "_%Y%m%d")
+    assert [one.path.name for one in found] == ["a_20200105.tif", "a_20200301.tif"]
+
+
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 def test_the_delimiter_of_a_list_is_that_of_its_header(tmp_path, delimiter):
     rows = [["Date", "File"], ["2020-01-05", '"a, b; c.tif"'], ["", "d.tif"]]

@@ -222,8 +222,8 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
             continue
         path = placed_at(name.document if name.is_item else name, options)
         if path.is_dir():
-            images = (file for file in path.iterdir() if file.suffix.lower() in RASTERS)
-            found += [_Given(file) for file in sorted(images, key=str)]
+            rasters = (file for file in path.iterdir() if file.suffix.lower() in RASTERS)
+            found += [_Given(file) for file in sorted(rasters, key=str)]
         elif path.suffix.lower() in (".csv", ".txt") and path.is_file():
             found += _listed(path, options)
         elif name.is_item and path.is_file():
@@ -232,7 +232,9 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
             matches = sorted(glob.glob(name))
             if not matches:
                 raise InputError("no file has such a name", file=path, field="orthos", remedy="check the pattern")
-            found += [_Given(Path(file)) for file in matches]
+            # A pattern such as scenes/* has side-cars, too.
+            images = [file for file in matches if Path(file).suffix.lower() in RASTERS]
+            found += [_Given(Path(file)) for file in images or matches]
         else:
             found.append(_Given(path))
     ask_beside(*(one.path for one in found), allow_network=options.allow_network)
@@ -300,7 +302,10 @@ def read_list(path: str | os.PathLike[str]) -> list[tuple[str, str | None]]:
     date = next((names.index(name) for name in _DATE if name in names), None)
     if file is None:
         raise InputError(
-            "this list has no column of files", file=path, field="line 1", remedy="name the columns file and date"
+            "this list has no column of files",
+            file=path,
+            field="line 1",
+            remedy="name the columns file and date; if this is a file next to an image, give the folder of the images",
         )
     found: list[tuple[str, str | None]] = []
     for number, row in enumerate(rows[1:], start=2):
