@@ -213,6 +213,21 @@ def test_areas_touch_at_corners_and_the_largest_is_first() -> None:
     motion = Motion(moving, moving, rate, rate + 1.0, np.zeros(15), np.full(15, "steady"))
     areas = motion.areas(cells)
     assert [one.tolist() for one in areas] == [[4, 8, 14], [0], [10]]
-    middle, sigma = motion.typical(areas[0])
+    middle, sigma = motion.typical(areas[0], cells)
     assert middle.tolist() == [8.0, -64.0]
     assert sigma == np.median([5, 9, 15, -15, -63, -195])
+
+
+def test_cells_next_to_still_ground_have_no_part_in_the_rate_of_an_area() -> None:
+    """Their chips show still ground, too. Most cells of a small area are at its rim."""
+    cells = Cells(np.zeros(2), 10.0, (7, 6))
+    moving, inner, tested = np.zeros((6, 7), dtype=bool), np.zeros((6, 7), dtype=bool), np.ones((6, 7), dtype=bool)
+    moving[1:, 1:6], inner[2:, 2:5] = True, True  # The area reaches the last row, where no ground is below.
+    moving[3, 3] = tested[3, 3] = inner[3, 3] = False  # A cell that was not tested is not still.
+    rate = np.where(inner, 1.0, 0.3).ravel()[:, None] * np.ones(2)
+    sigma = np.where(inner, 0.02, 0.05).ravel()[:, None] * np.ones(2)
+    motion = Motion(moving.ravel(), tested.ravel(), rate, sigma, np.zeros(42), np.full(42, "steady"))
+    middle, spread = motion.typical(motion.areas(cells)[0], cells)
+    assert (middle.tolist(), spread) == ([1.0, 1.0], 0.02)
+    narrow = np.flatnonzero(moving.ravel())[:5]
+    assert motion.typical(narrow, cells)[0].tolist() == [0.3, 0.3]

@@ -194,7 +194,7 @@ def _moving(stack: AdjustedStack, placed: Placed, metres: Array) -> list[MovingR
     to_lon_lat = ground_transform(placed.model.crs, "EPSG:4979")
     cell = (stack.cells.side**2) * abs(float(np.linalg.det(metres)))
     for area in motion.areas(stack.cells):
-        rate, sigma = motion.typical(area)
+        rate, sigma = motion.typical(area, stack.cells)
         rate, sigma = metres @ rate, sigma * float(np.sqrt(abs(np.linalg.det(metres))))
         middle = placed.model.image_to_ground(stack.cells.middles[area].mean(axis=0)[None], 0.0)
         lon, lat, _ = to_lon_lat(middle)[0]

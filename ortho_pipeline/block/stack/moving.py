@@ -74,12 +74,17 @@ class Motion:
         found = [np.flatnonzero(numbered.ravel() == number + 1) for number in range(count)]
         return sorted(found, key=lambda one: (-len(one), one[0]))
 
-    def typical(self, area: NDArray[np.int_]) -> tuple[Array, float]:
+    def typical(self, area: NDArray[np.int_], cells: Cells) -> tuple[Array, float]:
         """Return the rate ``(2,)`` of an area and its sigma along an axis, px a year: medians of its cells.
 
-        Cells at the rim move in part. Neighbours share errors, so the median is no more certain than one cell.
+        Cells at the rim move in part: those next to still ground do not count, if there are others. Neighbours share
+        errors, so the median is no more certain than one cell.
         """
-        return np.median(self.rate[area], axis=0), float(np.median(self.sigma[area]))
+        columns, rows = cells.shape
+        still = (self.tested & ~self.moving).reshape(rows, columns)
+        inner = area[~ndimage.binary_dilation(still, _NEXT).ravel()[area]]
+        some = inner if len(inner) else area
+        return np.median(self.rate[some], axis=0), float(np.median(self.sigma[some]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,7 @@ class ClosureRecord(Record):
 
 
 class MovingRecord(Record):
-    """Ground that moves, relative to the stable ground; rates and sigmas are the medians of its cells, m a year."""
+    """Ground that moves, relative to the stable ground; rates and sigmas are medians of its inner cells, m a year."""
 
     lon: float
     lat: float
