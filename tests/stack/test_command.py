@@ -22,6 +22,7 @@ from rasters import Rasters
 
 from ortho_pipeline.batch.stack import matching
 from ortho_pipeline.batch.stack.command import stack
+from ortho_pipeline.batch.stack.result import summary
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.files import Outputs
@@ -81,8 +82,12 @@ def test_corrections_are_the_errors(made):
     assert all(max(one.sigma_px) < 0.05 for one in record.dates)
     assert [one.status for one in record.pairs] == ["accepted"] * 6
     assert record.closure_after.loops == 4
+    assert "largest 0.00 px" not in summary(record)
     page = (made[1] / "stack.html").read_text()
-    assert "4 dates agree with the mean of all dates within" in page
+    interval = 1.96 * max(max(one.sigma_px) for one in record.dates)
+    stated = re.search(r"4 dates agree with the mean of all dates within (0\.\d+) px", page)
+    assert stated is not None
+    assert float(stated.group(1)) == pytest.approx(interval, rel=0.05)
     assert "Nothing here tests the absolute position." in page
     assert 'data-plot="timeline"' in page
 
@@ -107,7 +112,7 @@ def test_the_page_tells_what_affine_corrections_are_at_the_corners(made, tmp_pat
     write_page(record.replaced(dates=(sloped, *rest)), tmp_path / "affine.html")
     page = (tmp_path / "affine.html").read_text()
     assert re.search(
-        r"agree with the mean of all dates within 0\.\d\d px at the middle and 0\.20 px at the corners", page
+        r"agree with the mean of all dates within 0\.0\d+ px at the middle and 0\.2 px at the corners", page
     )
     assert '<td class="n">1.23 ± 0.10</td>' in page
 

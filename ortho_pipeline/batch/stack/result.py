@@ -13,6 +13,7 @@ import numpy as np
 from ortho_pipeline.batch.stack.matching import DatePair
 from ortho_pipeline.commands.arrays.cube import cube_of
 from ortho_pipeline.commands.results import Result
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.report.stack.records import DateRecord, StackRecord
@@ -102,10 +103,10 @@ def summary(record: StackRecord, fresh: int = 0) -> str:
     ]
     after = record.closure_after
     if after.median_px is not None:
-        before = record.closure_before
+        largest, rejected = (significant(one.largest_px or 0.0) for one in (after, record.closure_before))
         lines.append(
-            f"Loops of three pairs: misclosure {after.median_px:.3f} px (median; largest {after.largest_px:.2f} px, "
-            f"with rejected pairs {before.largest_px:.2f} px)"
+            f"Loops of three pairs: misclosure {after.median_px:.3f} px (median; largest {largest} px, "
+            f"with rejected pairs {rejected} px)"
         )
     lines.append(f"Moving ground: {counted(len(record.moving), 'area')}; steps: {len(record.steps)}")
     return "\n".join(lines)

@@ -69,8 +69,8 @@ def headline(record: StackRecord) -> str:
     where = ""
     if any(one.correction == "affine" for one in known):
         corner = _INTERVAL * max(one.corner_sigma_px or 0.0 for one in known)
-        where = f" at the middle and {corner:.2f} px at the corners"
-    text = f"{counted(len(known), 'date')} agree with {_datum(record)} within {worst:.2f} px{where}"
+        where = f" at the middle and {significant(corner)} px at the corners"
+    text = f"{counted(len(known), 'date')} agree with {_datum(record)} within {significant(worst)} px{where}"
     text = f"{text} (95 % interval, per axis)."
     return text if record.datum == "reference" else f"{text} Nothing here tests the absolute position."
 
