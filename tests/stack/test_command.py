@@ -190,6 +190,19 @@ def test_a_date_that_is_added_is_matched_alone(made, tmp_path, counted):
     assert contents(tmp_path / "out") == contents(made[1])
 
 
+def test_an_ortho_of_a_killed_run_goes_if_its_date_is_left_out(made, tmp_path):
+    """The record of an ortho comes after it: a run that was killed in between has left an ortho without a record."""
+    shutil.copytree(made[1], tmp_path / "out")
+    aligned, last = tmp_path / "out" / "aligned", made[0][3].stem
+    for name in (f"{last}.record.json", f"{last}_model.json"):
+        (aligned / name).unlink()
+    (aligned / "mine_aligned.tif").write_text("of a user")
+    run(made[0][:3], tmp_path / "out")
+    assert not list(aligned.glob(f"{last}*"))
+    assert (aligned / "mine_aligned.tif").exists()
+    assert len(list(aligned.glob("*_aligned.tif"))) == 4
+
+
 def test_pairs_whose_names_join_to_the_same_text_keep_their_own_matches(made, tmp_path, counted):
     (tmp_path / "in").mkdir()
     for path, name in zip(made[0], ("z", "y__z", "x", "x__y"), strict=True):

@@ -219,6 +219,17 @@ class RecordedFolder:
             return {name for name, _ in self.store.names()}
         return set(os.listdir(self.place)) if os.path.isdir(self.place) else set()
 
+    def begun(self, names: Iterable[str]) -> list[str]:
+        """Return the sets on this machine that were begun and have no record, and none of some names.
+
+        A command that was killed has left some of their files.
+        """
+        if self.is_far:
+            return []
+        known, there = {key_of_name(name) for name in names}, self.names()
+        found = sorted(path.name.removesuffix(".lock") for path in (Path(self.place) / STATE).glob("*.lock"))
+        return [name for name in found if key_of_name(name) not in known and _record_of(name) not in there]
+
     def others(self, names: Iterable[str]) -> dict[str, list[str]]:
         """Return the files of recorded sets that have none of some names, by name of set; the record is the last."""
         known, found = {key_of_name(_record_of(name)) for name in names}, {}

@@ -21,6 +21,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import write_moved
 from ortho_pipeline.exchange.rpc import RPC, export_rpc, write_vrt
+from ortho_pipeline.files import clear_up
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
@@ -74,6 +75,11 @@ class Writer:
         found: list[str] = []
         for name, files in self.folder.others(one.name for one in sets).items():
             found += [f"{name}_stac.json", f"{name}_delivery.json", *files]
+        for name in self.folder.begun(one.name for one in sets):
+            files = [f"{name}{end}" for end in (_TIF, _VRT, "_model.json")]
+            for file in files:
+                clear_up(Path(self.folder.place) / file)
+            found += files
         # Those of an earlier run with the other kind of output.
         found += [f"{one.name}{end}" for one in sets for end in (_TIF, _VRT) if one.files.get(end[-3:]) is None]
         there = self.folder.names()
