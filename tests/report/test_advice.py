@@ -19,6 +19,24 @@ def test_the_code_follows_the_text():
     assert lines[2] == "Warning: G03 was left out [left-out]"
 
 
+def test_many_notices_of_one_kind_are_few_lines():
+    kinds = ("datum-unknown", "left-out", "from-sensor")
+    found = signals([], [{"code": code, "text": f"image {n}: {code}"} for n in range(9) for code in kinds])
+    lines = [str(line) for line in signal_lines(found)]
+    unknown = [line for line in lines if line.endswith("[datum-unknown]")]
+    assert unknown[:3] == [f"Warning: Image {n}: datum-unknown [datum-unknown]" for n in range(3)]
+    assert unknown[3:] == ["Warning: 6 more of this kind [datum-unknown]"]
+    assert lines[lines.index(unknown[3]) + 1].startswith("  Remedy: ")
+    assert sum(line.endswith("[left-out]") for line in lines) == 4
+    # Texts that have no code of their own can be of different kinds.
+    assert sum(line.endswith("[from-sensor]") for line in lines) == 9
+
+
+def test_four_notices_of_one_kind_are_all_shown():
+    lines = signal_lines(signals([], [{"code": "left-out", "text": f"G{n}"} for n in range(4)]))
+    assert [line for line in lines if line.startswith("Warning")] == [f"Warning: G{n} [left-out]" for n in range(4)]
+
+
 def test_a_page_says_once_what_to_do_about_notices_of_one_kind():
     loader = jinja2.PackageLoader("ortho_pipeline", "report/templates")
     environment = jinja2.Environment(loader=loader, autoescape=True)

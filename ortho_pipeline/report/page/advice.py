@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.notices import FROM_SENSOR, Notice
 from ortho_pipeline.errors.texts import Setting, Text
 
 Level = Literal["stop", "look", "know"]
@@ -150,6 +150,8 @@ _KNOW: dict[str, str] = {
 }
 _LEVELS: tuple[tuple[Level, dict[str, str]], ...] = (("stop", _STOP), ("look", _LOOK), ("know", _KNOW))
 _NOTHING = "Nothing to do"
+#: Notices of one code that the terminal shows; it counts the others.
+_SHOWN = 3
 #: Of a code that this version does not know.
 _UNKNOWN = "Read this before you use the ortho."
 #: The levels in words, the gravest first.
@@ -195,13 +197,30 @@ def signals(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *, te
 
 
 def signal_lines(found: Sequence[Signal]) -> list[Text]:
-    """Return notices as lines for the terminal; what several of them have to do stands once, below the last."""
+    """Return notices as lines for the terminal, those of a code together.
+
+    Of more than a few of one code, the others are counted. What several have to do stands once, below the last.
+    """
     lines: list[Text] = []
-    for number, one in enumerate(found):
+    shown = _counted(found)
+    for number, one in enumerate(shown):
         lines.append(Text(f"{WORDS[one.level]}: ", one.text, f" [{one.code}]"))
-        if one.to_do not in [other.to_do for other in found[number + 1 : number + 2]]:
+        if one.to_do not in [other.to_do for other in shown[number + 1 : number + 2]]:
             lines += [] if one.to_do.startswith(_NOTHING) else [Text("  Remedy: ", one.to_do)]
     return lines
+
+
+def _counted(found: Sequence[Signal]) -> list[Signal]:
+    """Return the first signals of each code, and one that counts the others. Texts without a code of their own stay."""
+    kinds: dict[str, list[Signal]] = {}
+    for one in found:
+        kinds.setdefault(one.text if one.code == FROM_SENSOR else one.code, []).append(one)
+    shown: list[Signal] = []
+    for alike in kinds.values():
+        shown += alike if len(alike) <= _SHOWN + 1 else alike[:_SHOWN]
+        if (more := len(alike) - _SHOWN) > 1:
+            shown.append(replace(alike[-1], text=f"{more} more of this kind"))
+    return shown
 
 
 def _signal(notice: Mapping[str, Any]) -> tuple[Level, str, str, str]:
