@@ -20,7 +20,7 @@ from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
+from ortho_pipeline.commands.block_images import labels_of, refuse_copies, scenes_of, start_of
 from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
 from ortho_pipeline.commands.block_results.orthos import (
     adjusted_scenes,
@@ -138,6 +138,7 @@ def adjust(
     written = of_orthos | of_mosaic | ({"export": files_for(programs, Path(folder), labels)} if programs else {})
     _check_paths(files, images, points, scenes, *models, match=match, surface=surface, further=written)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
+    refuse_copies(images, scenes)
     gathered = gather(images, labels, scenes, points, match, surface)
     starts = _starts(images, labels, scenes, points, gathered.table)
     fit = adjust_block(
@@ -151,7 +152,6 @@ def adjust(
     # The block has the last word on the accuracy of the DEM.
     asked = fit.heights is None and points.dem_heights == "on"
     notes = [one for one in (*placed, *gathered.notices) if asked or one.code != "dem-sigma-by-default"]
-    notes += relative_to_reference(fit, points, match)
     plain = {label: _plain(fit.models[label]) for label in labels}
     exported, complaints = _exported(plain, files)
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
@@ -160,7 +160,7 @@ def adjust(
         starts=starts,
         exported=exported,
         provenance=record,
-        warnings=[*left_out, *_warnings(fit, starts), *notes, *complaints],
+        warnings=[*left_out, *_warnings(fit, starts), *notes, *relative_to_reference(fit, points, match), *complaints],
         join_limit=points.join_limit,
         dem_unused=surface.dem is not None and points.dem_heights == "off",
     )

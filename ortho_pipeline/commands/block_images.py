@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,9 @@ from ortho_pipeline.models import ImageCorrection, families, family_of, start_mo
 from ortho_pipeline.options import BlockOptions, SceneOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.formats import names_image
+
+#: Bytes at the beginning of a file that tell most files of one size from each other.
+_BEGINNING = 4096
 
 
 def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
@@ -49,6 +54,34 @@ def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
         if seen[label.lower()] > 1:
             labels[number] = f"{label}_{seen[label.lower()]}"
     return labels
+
+
+def refuse_copies(images: Sequence[str | os.PathLike[str]], scenes: Sequence[SceneOptions]) -> None:
+    """Refuse copies of a file whose models are the same, too: ties between them fit whatever their common errors are.
+
+    Raises
+    ------
+    InputError
+        It names both files.
+    """
+    alike: dict[tuple[int, bytes], list[int]] = {}
+    for number, image in enumerate(images):
+        if os.path.isfile(image):
+            with open(image, "rb") as file:
+                alike.setdefault((os.path.getsize(image), file.read(_BEGINNING)), []).append(number)
+    for first, second in (pair for numbers in alike.values() for pair in combinations(numbers, 2)):
+        if filecmp.cmp(images[first], images[second], shallow=False) and _same_models(
+            *(inputs.open_image(images[number], scenes[number], needs_model=False) for number in (first, second))
+        ):
+            raise InputError(
+                f"this is a copy of {os.fspath(images[first])}, so its errors would count twice",
+                file=images[second],
+                remedy="leave one of the two out",
+            )
+
+
+def _same_models(one: Scene, other: Scene) -> bool:
+    return bool(one.models and other.models) and one.model.to_dict() == other.model.to_dict()
 
 
 def scenes_of(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from servers import moto_server
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.block_images import labels_of, points_of_images
+from ortho_pipeline.commands.block_images import labels_of, points_of_images, refuse_copies
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.exchange.model_file import load_model
@@ -490,6 +491,19 @@ def test_labels_are_unique(tmp_path: Path) -> None:
     assert len({label.lower() for label in labels}) == 4
     with pytest.raises(InputError, match="listed twice"):
         labels_of([paths[0], paths[1], paths[0]])
+
+
+def test_a_copy_of_an_image_is_refused(sample: Path, tmp_path: Path) -> None:
+    """Their ties fit perfectly, and the errors that both have would count as independent."""
+    images = [sample / "photos" / f"photo{number}.jpg" for number in (1, 2)]
+    refuse_copies(images, [SceneOptions()] * 2)
+    copy = Path(shutil.copy(images[0], tmp_path / "photo1 (1).jpg"))
+    with pytest.raises(InputError, match=r"this is a copy of .*photo1\.jpg") as error:
+        refuse_copies([*images, copy], [SceneOptions()] * 3)
+    assert str(error.value.file) == str(copy)
+    # The same pixels with models of their own, as of simulations, are different images.
+    other = SceneOptions(sensor_options={"pitch": "horizon", "heights": "0,100"})
+    refuse_copies([images[0], copy], [SceneOptions(), other])
 
 
 def test_names_in_point_files_find_their_images(stereo: Stereo) -> None:
