@@ -90,6 +90,19 @@ def test_an_image_outside_the_dem_is_named(tmp_path: Path, fill: str, told: str)
     assert str(error.value.remedy).endswith("; or leave this image out")
 
 
+def test_all_images_outside_the_dem_are_named(tmp_path: Path) -> None:
+    """Two photos of three are west of the DEM: both have to be left out, so both are named at once."""
+    write_dem(tmp_path / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")
+    scenes = {}
+    for name, x in (("far", 299_100.0), ("near", 300_000.0), ("farther", 299_000.0)):
+        interior = Interior(600, 400, 0.006, 1e-5, 1e-5)
+        model = FrameCamera.from_map(interior, "EPSG:32651", [x, 2.7e6, 180.0, 0, 0, 0], frame="map", heights=(0, 100))
+        scenes[name] = Scene("frame", name, 600, 400, {"frame": model}, "table")
+    with pytest.raises(CoverageError, match=r"image far: .*no pixels\. .* either: farther") as error:
+        orthos_of_blocks.on_one_grid(scenes, open_dem(tmp_path / "dem.tif", "ellipsoid", fill="mask"), OutputOptions())
+    assert str(error.value.remedy).endswith("; or leave these images out")
+
+
 def test_options_of_orthos_need_orthos(sample: Path, tmp_path: Path) -> None:
     image = sample / "cartosat" / "BANDA.tif"
     done = CliRunner().invoke(

@@ -34,6 +34,8 @@ from ortho_pipeline.surface.footprint import ground_sample_distance, lay, output
 
 #: Outputs of `rectify` that orthos of a block do not have.
 _NOT_AGAIN = ("model", "rpc", "vrt")
+#: Further images outside the heights that an error names.
+_NAMED = 20
 
 
 def ortho_files(folder: Path, labels: Sequence[str], output: OutputOptions) -> dict[str, dict[str, Path]]:
@@ -84,26 +86,39 @@ def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOpt
     Raises
     ------
     CoverageError
-        If the heights do not cover an image. The message names it.
+        If the heights do not cover an image. The message names all such images.
     """
     steps, crs = [], None if output.crs is None else map_crs(output.crs)
+    outside: dict[str, CoverageError] = {}
     for label, scene in scenes.items():
         found = lay(scene.model, surface, scene.width, scene.height)
         try:
             found.require_coverage()
         except CoverageError as error:
-            raise CoverageError(
-                Text(f"image {label}: ", error.message),
-                file=error.file,
-                field=error.field,
-                remedy=Text(error.remedy or "", "; or leave this image out"),
-            ) from error
+            outside[label] = error
+            continue
         crs = crs or output_crs(scene.model, scene.width, scene.height)
         steps.append(two_digits(ground_sample_distance(scene.model, crs, scene.width, scene.height, found.middle)))
+    if outside:
+        raise _named(outside)
     if output.like is not None or crs is None:
         return output
     resolution = min(steps) if output.resolution is None else output.resolution
     return replace(output, crs=crs_text(crs), resolution=resolution)
+
+
+def _named(outside: Mapping[str, CoverageError]) -> CoverageError:
+    """Return the error of the first of these images, with the names of the others."""
+    (first, error), *others = outside.items()
+    names = ", ".join(label for label, _ in others[:_NAMED])
+    more = f", and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+    also = f". The DEM does not cover these images either: {names}{more}" if others else ""
+    return CoverageError(
+        Text(f"image {first}: ", error.message, also),
+        file=error.file,
+        field=error.field,
+        remedy=Text(error.remedy or "", f"; or leave {'these images' if others else 'this image'} out"),
+    )
 
 
 @cache_restored()
