@@ -59,6 +59,7 @@ NOMINAL = {"focal_length": 0.02, "x0": 0.005, "y0": 0.005, "k1": 0.03, "k2": 0.0
 FILM = NOMINAL | {"focal_length": 0.03}
 _PIXEL = 1e-6
 _NO_CROPS = "give the whole photo; crops are not supported"
+_TURNED = "a program has turned this photo, so its angles do not fit its pixels: give the photo as the camera wrote it"
 _REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs/formats/frame.md)"
 
 
@@ -147,10 +148,11 @@ def _full_size(tags: Tags, width: int, height: int) -> tuple[float, float]:
         full, rows = float(width), float(height)
     # A reduced copy has whole pixels.
     if abs(full * height - rows * width) > max(full, rows):
+        turned = abs(full * width - rows * height) <= max(full, rows)
         raise tags.error(
             f"the photo has {full:.0f} x {rows:.0f} pixels by its tags, but the file {width} x {height}",
             "PixelXDimension",
-            _NO_CROPS,
+            _TURNED if turned else _NO_CROPS,
         )
     scale = _scale(tags, full, rows)
     return full * scale, rows * scale

@@ -392,6 +392,14 @@ def test_a_reduced_copy_that_states_its_own_size_is_known_by_the_optical_centre(
     assert opened(path, sensor_width="13.2").facts["focal_length_px"] == pytest.approx(50, abs=1e-3)
 
 
+def test_a_photo_that_a_program_turned_is_no_crop(tmp_path):
+    """Its tags have the size and the angles of the camera, its pixels are turned by 90 degrees."""
+    path = photo(tmp_path / "a.tif", {**EXIF, "PixelXDimension": "600", "PixelYDimension": "400"}, DJI, size=(400, 600))
+    with pytest.raises(InputError, match="600 x 400 pixels by its tags, but the file 400 x 600") as error:
+        opened(path)
+    assert "turned this photo" in error.value.remedy
+
+
 def test_the_optical_centre_shows_a_crop(tmp_path):
     exif = {**EXIF, "PixelXDimension": "300", "PixelYDimension": "300"}
     path = photo(tmp_path / "a.tif", exif, {**DJI, **DEWARP, **CENTRE}, size=(300, 300))
