@@ -12,6 +12,8 @@ import pytest
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.heights.source import DemHeights
+from ortho_pipeline.block.shared.unknowns import SharedUnknowns
+from ortho_pipeline.errors import NotConverged
 from ortho_pipeline.estimation.observations.prior import Prior
 
 
@@ -82,3 +84,20 @@ def test_two_cameras_are_two_unknowns(flown):
     found = [one for one in fit.shared_priors.records if one.name == "focal_length"]
     assert [one.images for one in found] == [8, 8]
     assert abs(found[0].value - found[1].value) < 4 * np.hypot(found[0].sigma, found[1].sigma)
+
+
+def test_the_search_for_gross_errors_begins_with_the_stated_camera_where_they_lead_it_away():
+    """Seven wrong of 351 measurements did that in a block of seven photos. Without them the camera is found."""
+
+    class LedAway:
+        def settled(self, *given: Any) -> Any:
+            raise NotConverged("the adjustment did not converge with the parameters of the camera")
+
+    priors: Any = LedAway()
+    solved: Any = object()
+    near, shared = SharedUnknowns(None, None, priors).near(solved, None)  # type: ignore[arg-type]
+    assert near is solved
+    assert shared.priors is priors
+    # Afterwards it is an error.
+    with pytest.raises(NotConverged):
+        shared.settled(solved, None)  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.shared.common_error import BlockCommonError
 from ortho_pipeline.block.shared.priors import SharedPriors
+from ortho_pipeline.errors import NotConverged
 from ortho_pipeline.models.base import Array
 
 #: Heights of a DEM are renewed so often before the search for gross errors.
@@ -35,12 +37,16 @@ class SharedUnknowns:
         return problem
 
     def near(self, solved: Solved, selection: Selection) -> tuple[Solved, SharedUnknowns]:
-        """Return a solution near that with heights and shared parameters, to look for gross errors from."""
+        """Return a solution near that with heights and shared parameters, to look for gross errors from.
+
+        Gross errors can lead shared parameters away. The search then begins with their stated values.
+        """
         heights, priors = self.heights, self.priors
         if heights is not None:
             solved, heights = heights.settled(solved, selection, _FIRST_ROUNDS)
         if priors is not None:
-            solved, priors, heights = priors.settled(solved, selection, heights, NEAR)
+            with contextlib.suppress(NotConverged):
+                solved, priors, heights = priors.settled(solved, selection, heights, NEAR)
         return solved, replace(self, heights=heights, priors=priors)
 
     def settled(self, solved: Solved, selection: Selection) -> tuple[Solved, SharedUnknowns]:
