@@ -27,6 +27,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control import command
 from ortho_pipeline.commands.control.points import read_control
 from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.survey.folder import survey
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpc_txt
@@ -551,6 +552,8 @@ def test_a_volume_is_its_one_product(tiled: tuple[Path, Path, Pushbroom], given:
     scene = open_scene(top / given)
     assert ((scene.width, scene.height), list(scene.models)) == ((300, 400), ["rpc", "pushbroom"])
     assert Path(scene.path) == folder / "DIM_A.XML"
+    # A survey lists neither the tiles nor the volume again.
+    assert survey(top).of("scene") == [f"{folder.name}/DIM_A.XML"]
 
 
 @pytest.mark.driver("DIMAP")

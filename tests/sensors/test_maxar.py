@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 from used import pixels, ran, used
 
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.survey.folder import survey
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
@@ -279,6 +280,8 @@ def test_tiles_are_one_scene(folder: Path, whole: tuple[Pushbroom, RPC]) -> None
         (TILES[0][0], (0, 0)),
         (TILES[1][0], (40, 0)),
     ]
+    # A survey of the folder lists the whole, and no pixel twice.
+    assert survey(folder).of("scene") == [f"{STEM}.TIL"]
 
 
 def test_a_wrong_size_of_the_whole_does_not_move_tiles(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:

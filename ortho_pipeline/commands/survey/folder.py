@@ -19,6 +19,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.shell import typed
+from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.host.unread import unread
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import read_points
@@ -59,7 +60,8 @@ _NAMED = 10
 class SurveyedFile:
     """A file, by its path from the folder: its kind, its description, and the models of a scene.
 
-    `reach` is how far pixels reach (columns, rows): the size of a scene, and the median place of points.
+    `reach` is how far pixels reach (columns, rows): the size of a scene, and the median place of points. `tiles` are
+    the files of which the image of a scene consists.
     """
 
     path: str
@@ -67,6 +69,7 @@ class SurveyedFile:
     said: str
     models: tuple[str, ...] = ()
     reach: tuple[float, float] = (0.0, 0.0)
+    tiles: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,8 @@ class FolderSurvey:
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho info FOLDER --json``."""
-        files = [{name: value for name, value in vars(file).items() if name != "reach"} for file in self.found]
+        inner = ("reach", "tiles")
+        files = [{name: value for name, value in vars(file).items() if name not in inner} for file in self.found]
         return {"schema_version": SCHEMA_VERSION, "folder": str(self.folder), "files": json_value(files)}
 
 
@@ -183,7 +187,7 @@ def _looked_at(path: Path, folder: Path, options: SceneOptions) -> SurveyedFile 
         return None
     suffix, name = path.suffix.lower(), str(path.relative_to(folder))
     if suffix in IMAGES:
-        return _image(path, name, options)
+        return _image(path, folder, options)
     # JSON files are mostly reports and models.
     return _points(path, name) if suffix in SUFFIXES and suffix != ".json" else None
 
@@ -194,7 +198,8 @@ def _is_ours(path: Path) -> bool:
     return path.with_name(path.name.removesuffix(ending) + ENDINGS["report"]).exists()
 
 
-def _image(path: Path, name: str, options: SceneOptions) -> SurveyedFile | None:
+def _image(path: Path, folder: Path, options: SceneOptions) -> SurveyedFile | None:
+    name = str(path.relative_to(folder))
     try:
         scene = host.open_scene(path, options.sensor, dict(options.sensor_options), **options.access)
     except OrthoError as error:
@@ -206,7 +211,25 @@ def _image(path: Path, name: str, options: SceneOptions) -> SurveyedFile | None:
         f"{scene.width} x {scene.height}, {scene.sensor}, {models} of {_short(scene.model_source)}",
         tuple(scene.models),
         (scene.width, scene.height),
+        tuple(os.path.relpath(tile, folder) for tile in _tiles(scene, path)),
     )
+
+
+def _tiles(scene: Scene, path: Path) -> list[str]:
+    """Return the files of which the image of a scene consists, such as the tiles of a .TIL; none if it is one file.
+
+    The other tiles of a tile are outside of it. A list of one product is opened as that product.
+    """
+    if Path(scene).resolve() != path.resolve():
+        return [os.fspath(scene)]
+    metadata = path.suffix.lower() == ".xml"
+    tiles = []
+    for piece in scene.pieces:
+        (left, top), (width, height) = piece.offset, piece.size or (0, 0)
+        inside = left >= 0 and top >= 0 and left + width <= scene.width and top + height <= scene.height
+        if inside and piece.model is None and piece.scale == 1 and (piece.size or metadata):
+            tiles.append(os.fspath(piece.path))
+    return tiles
 
 
 def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -> SurveyedFile | None:
@@ -247,14 +270,21 @@ def _points(path: Path, name: str) -> SurveyedFile | None:
 
 
 def _without_parts(files: list[SurveyedFile]) -> list[SurveyedFile]:
-    """Leave out metadata that open as the same image as another file."""
+    """Leave out tiles of an image that is listed as a whole, and metadata of an image that is listed."""
     scenes = {
-        Path(file.path).with_suffix("") for file in files if file.kind == "scene" and not file.path.endswith(".xml")
+        Path(file.path).with_suffix("")
+        for file in files
+        if file.kind == "scene" and not file.path.lower().endswith(".xml")
     }
+    images = {file.path for file in files if file.kind in ("scene", "image")}
+    several = {tile for file in files if len(file.tiles) > 1 for tile in file.tiles}
+    # Of an image in one file, that file is listed.
+    same = {file.path for file in files if len(file.tiles) == 1 and file.tiles[0] in images}
     return [
         file
         for file in files
-        if not (
+        if file.path not in (several & images) | same
+        and not (
             file.path.lower().endswith(".xml") and (file.kind != "scene" or Path(file.path).with_suffix("") in scenes)
         )
     ]
