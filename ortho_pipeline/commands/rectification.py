@@ -45,6 +45,7 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
 from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.raster.valid_area import doubtful_alpha
 from ortho_pipeline.raster.verified_writing import checked_options, require_whole
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
@@ -260,6 +261,7 @@ def make_ortho(resolved: Resolved, files: dict[str, Path], job: OrthoJob) -> Sce
         budget, notes = layers.budget_of(placed)
         path = layers.ortho_of(placed, files, other_of(placed, source))
         warped = warp_placed(placed, exported, source, path, job.stage)
+        doubts = doubtful_alpha(source.dataset) if source.validity in ("alpha", "mask") else []
         job.stage("Layers and report", 0.0)
         accuracy = layers.write_layers(placed, budget, warped, files)
         angles = write_angles(placed, sun, files)
@@ -269,7 +271,7 @@ def make_ortho(resolved: Resolved, files: dict[str, Path], job: OrthoJob) -> Sce
         _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
 
     def described() -> SceneReport:
-        outcome = _report_of(placed, exported, warped, record | read_since(job.before), [*complaints, *notes])
+        outcome = _report_of(placed, exported, warped, record | read_since(job.before), [*complaints, *notes, *doubts])
         outcome = report.with_layers(outcome, accuracy=accuracy, angles=angles)
         write_report(outcome, adjusted.fit, files, adjusted.matched, source)
         if acquired is not None:

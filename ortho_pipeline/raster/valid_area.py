@@ -16,6 +16,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.files.shell import converted
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.raster.pixel_types import numpy_type
 from ortho_pipeline.raster.regridded import grid_of
@@ -29,6 +31,10 @@ _STEPS = 32
 _DECIMALS = 7
 #: GDAL's number of the colour interpretation alpha (GCI_AlphaBand).
 _ALPHA = 6
+#: Windows along each side of an alpha band in which its values are counted, and their side (px).
+_WINDOWS, _WINDOW = 4, 32
+#: Different values from which on an alpha band that is mostly neither 0 nor opaque has data.
+_SEVERAL = 16
 
 
 def valid_outline(path: str | PathLike[str], *, side: int = _SIDE) -> BaseGeometry:
@@ -61,6 +67,39 @@ def sampled_mask(bands: Sequence[Any], columns: int, rows: int) -> NDArray[np.bo
                 own &= ~np.isnan(band.ReadAsArray(**sample))
             valid |= own
     return valid
+
+
+def doubtful_alpha(dataset: Any) -> list[Notice]:
+    """Return a warning if the alpha band of a raster seems to have data: GDAL takes the fourth of four bands for alpha.
+
+    An alpha band is 0 or opaque nearly everywhere; only its edges have values between.
+    """
+    for number in range(1, dataset.RasterCount + 1):
+        band = dataset.GetRasterBand(number)
+        if band.GetColorInterpretation() != _ALPHA or (kind := numpy_type(band.DataType)).kind == "f":
+            continue
+        values = _sampled_values(band)
+        between = values[(values != 0) & (values != np.iinfo(kind).max)]
+        if len(np.unique(between)) < _SEVERAL or 2 * len(between) < np.count_nonzero(values):
+            continue
+        name = dataset.GetDescription()
+        text = (
+            f"band {number} of {name} is marked as alpha, but seems to have data, such as near infrared. "
+            f"Pixels where it is 0 count as empty. If it has data, remove the mark: `gdal_translate "
+            f"-colorinterp_{number} undefined {converted(name, 'bands')}`, and use the new file"
+        )
+        return [Notice("doubtful-alpha", text, band=number)]
+    return []
+
+
+def _sampled_values(band: Any) -> NDArray[Any]:
+    """Return values of a band in windows spread over it."""
+    starts = []
+    for length in (band.XSize, band.YSize):
+        starts.append(np.linspace(0, max(length - _WINDOW, 0), _WINDOWS + 2).astype(int)[1:-1])
+    size = min(_WINDOW, band.XSize), min(_WINDOW, band.YSize)
+    windows = [band.ReadAsArray(left, top, *size) for top in starts[1].tolist() for left in starts[0].tolist()]
+    return np.concatenate([window.ravel() for window in windows])
 
 
 def to_geojson(outline: BaseGeometry, crs: pyproj.CRS) -> tuple[dict[str, Any], list[float]]:

@@ -37,6 +37,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
 from ortho_pipeline.raster.opening import gate
 from ortho_pipeline.raster.regridded import grid_of, warped_bounds
 from ortho_pipeline.raster.source import RasterSource, open_dataset, open_pixels
+from ortho_pipeline.raster.valid_area import doubtful_alpha
 from ortho_pipeline.warp.mosaic.layout import Mosaic, Ortho, lay_out
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -211,6 +212,19 @@ def _tiles(printed: Printed, folder: Path) -> None:
         patch.setattr("ortho_pipeline.raster.source.MAX_BLOCK", 1_000_000)
         printed.paste(refused(open_dataset, path))
         open_dataset(folder / "a strip_tiled.tif")
+
+
+@case("raster", "gdal_translate -colorinterp")
+def _alpha_of_data(printed: Printed, folder: Path) -> None:
+    path = folder / "near infrared.tif"
+    made = gdal.GetDriverByName("GTiff").Create(str(path), 40, 40, 4)
+    made.WriteArray(np.arange(6400).reshape(4, 40, 40) % 200)
+    del made
+    (notice,) = doubtful_alpha(gdal.Open(str(path)))
+    printed.paste(notice)
+    source = RasterSource(folder / "near infrared_bands.tif")
+    assert (source.count, source.validity) == (4, "all")
+    assert doubtful_alpha(source.dataset) == []
 
 
 @case("raster", "gdal_calc.py -A")

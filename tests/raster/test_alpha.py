@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.raster.valid_area import doubtful_alpha
 
 SIDE = 40
 
@@ -68,3 +70,18 @@ def test_two_files_with_an_alpha_band_each_have_a_mask(tmp_path):
     assert source.validity == "mask"
     valid = source.read_valid(0, 0, source.read(0, 0, SIDE, SIDE))
     np.testing.assert_array_equal(valid, np.broadcast_to(pixels[3] > 0, (8, SIDE, SIDE)))
+
+
+@pytest.mark.parametrize(("data", "doubtful"), [(True, True), (False, False)])
+def test_an_alpha_band_with_data_is_doubted(tmp_path, data, doubtful):
+    """GDAL takes the fourth of four bands of bytes for alpha, such as near infrared."""
+    pixels = write(tmp_path / "image.tif")
+    made = gdal.Open(str(tmp_path / "image.tif"), gdal.GA_Update)
+    if data:
+        made.GetRasterBand(4).WriteArray(pixels[0] // 2)
+    del made
+    rectified(tmp_path)
+    report = json.loads((tmp_path / "o" / "image_report.json").read_text())
+    assert ("doubtful-alpha" in [notice["code"] for notice in report["notices"]]) == doubtful
+    made = gdal.Open(str(tmp_path / "image.tif"))
+    assert [notice.fields for notice in doubtful_alpha(made)] == [{"band": 4}] * doubtful

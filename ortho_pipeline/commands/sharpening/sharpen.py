@@ -32,6 +32,7 @@ from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.pansharpened import CommonExtent, Pansharpened, colour_bands
 from ortho_pipeline.raster.regridded import Regridded, coarser, grid_of, part_of, warped_bounds
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.raster.valid_area import doubtful_alpha
 from ortho_pipeline.runtime.process_limits import Progress, one_blas_thread
 
 SCHEMA_VERSION = 1
@@ -114,6 +115,7 @@ def sharpen(
     document["registration"] = None if agreement is None else agreement.to_json()
     document["quality"] = reduced_quality(samples, chosen, pair.whole_ratio, pair.sources[1].dtype)
     notices += _no_gain(document["quality"])
+    notices += doubtful_alpha(pair.sources[1].dataset)
     samples.clear()
     with together(folder, stem):
         document["valid_pixels"] = _write(pair, chosen, files["ortho"], stage)

@@ -92,6 +92,7 @@ _LOOK: dict[str, str] = {
     "dem-items-overlap": "To use other items, list them in a file.",
     "dem-covers-part": "Use a larger DEM if you need the rest.",
     "accuracy-in-part": "State the missing accuracies, so that the figures include them.",
+    "doubtful-alpha": "If the band has data, remove the mark, and make the ortho again.",
     "memory-exceeded": Text("Increase ", Setting("output.memory"), ", or use ", Setting("output.engine", "ortho"), "."),
     "rpc-approximate": "Use the model file or the ortho where this error matters.",
     "maybe-a-crop": Text(
