@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 from bundles import CORNER, Bundle, errors, write
 from click.testing import CliRunner, Result
@@ -16,13 +18,13 @@ from osgeo_utils.gdal_pansharpen import gdal_pansharpen
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.sharpening import registration
 from ortho_pipeline.commands.sharpening.quality import reduced_quality
-from ortho_pipeline.commands.sharpening.samples import Sample, regress
+from ortho_pipeline.commands.sharpening.samples import Sample, read_samples, regress
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.pansharpened import Pansharpened
 from ortho_pipeline.raster.regridded import grid_of
-from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.raster.source import Grid, RasterSource
 
 gdal.UseExceptions()
 
@@ -316,6 +318,30 @@ def test_too_little_detail_is_a_warning(tmp_path: Path) -> None:
     assert document["registration"] is None
     # The detail is noise, so it does not help either.
     assert [notice["code"] for notice in document["notices"]] == ["sharpen-not-matched", "sharpen-no-gain"]
+
+
+def test_a_large_ratio_has_a_quality_and_one_too_large_is_named() -> None:
+    """Windows hold enough reduced pixels at any ratio."""
+    random = np.random.default_rng(0)
+    wide = random.uniform(100, 200, (4, 200, 200))
+
+    def image(pixels: np.ndarray) -> Any:
+        def read(left: int, top: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+            part = pixels[:, top : top + height, left : left + width]
+            return part, np.ones(part.shape, dtype=bool)
+
+        return SimpleNamespace(read=read)
+
+    def samples_of(side: int, ratio: int) -> list[Sample]:
+        grid = Grid(pyproj.CRS("EPSG:32636"), 0.0, 0.0, 20.0, 20.0, side, side)
+        return read_samples(image(wide.mean(axis=0)[None]), image(wide), (1, 2, 3, 4), grid, ratio)
+
+    quality = reduced_quality(samples_of(200, 20), [0.25] * 4, 20)
+    assert quality is not None
+    assert quality["pixels"] >= 1600
+    with pytest.raises(InputError, match="9 multispectral pixels in common; the weights of 4 bands need 40") as caught:
+        regress(samples_of(3, 100), 4)
+    assert "ratio" in str(caught.value.remedy)
 
 
 def test_registration_needs_a_match(tmp_path: Path) -> None:

@@ -19,12 +19,15 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import Grid
 
 #: Side (coarse px) of a window, and the most values of all windows together (float32: 12 MB).
 _SIDE, _VALUES = 128, 3_000_000
+#: Fewest pixels of the reduced images along a window, for the quality; three at each rim are not compared.
+_REDUCED = 8
 #: Fewest pixels with a value in both orthos, for each weight.
 _FEWEST = 10
 
@@ -69,7 +72,7 @@ def read_samples(pan: Regridded, colours: Regridded, bands: Sequence[int], grid:
     """
     starts, sides = [], []
     for length in (grid.width, grid.height):
-        side = min(_SIDE, length)
+        side = min(max(_SIDE, _REDUCED * multiple), length)
         side = max(side // multiple * multiple, min(multiple, length))
         starts.append(np.linspace(0, length - side, max(1, length // side)).astype(int))
         sides.append(side)
@@ -90,7 +93,8 @@ def regress(samples: Sequence[Sample], count: int) -> Weights:
     Raises
     ------
     InputError
-        If too few pixels have a value in both orthos, or no band is positively related to the panchromatic one.
+        If the orthos have too few pixels, or too few with a value in both, or no band is positively related to the
+        panchromatic one.
     """
     valid = [np.isfinite(sample.pan) & np.isfinite(sample.colours).all(axis=0) for sample in samples]
     highest = max(
@@ -108,9 +112,17 @@ def regress(samples: Sequence[Sample], count: int) -> Weights:
         pixels += len(observed)
         total += float(observed.sum())
         squares += float((observed**2).sum())
+    every = sum(sample.pan.size for sample in samples)
+    if every < _FEWEST * count:
+        raise InputError(
+            f"the orthos have {counted(every, 'multispectral pixel')} in common; the weights of {count} bands need "
+            f"{_FEWEST * count}",
+            field="ratio",
+            remedy=Text("give larger orthos, or a smaller ", Setting("ratio")),
+        )
     if pixels < _FEWEST * count:
         raise InputError(
-            "the panchromatic and the multispectral ortho have no valid pixels in common",
+            "the panchromatic and the multispectral ortho have (almost) no valid pixels in common",
             field="nodata",
             remedy="check the nodata values and masks of both",
         )

@@ -312,7 +312,7 @@ def _agreement(pair: OrthoPair, regression: Weights) -> tuple[Agreement | None, 
                 file=pair.paths[1],
                 remedy="give both orthos of one acquisition and place",
             ) from error
-        text = f"the registration of the orthos is unknown: they have too little detail to match ({error.message})"
+        text = f"the registration of the orthos is unknown: they could not be matched ({error.message})"
         return None, [Notice("sharpen-not-matched", text)]
     notices = [] if (notice := displaced(agreement, *pair.paths)) is None else [notice]
     if not alike:
@@ -392,7 +392,10 @@ def _summary(document: Mapping[str, Any]) -> str:
             f"{found['row_px']:+.2f} ± {found['sigma_row_px']:.2f} px (PAN minus MS), RMS {found['rmse_px']:.2f} px"
         )
     if quality is None:
-        return "\n".join([*lines, "Quality unknown: the orthos are too small to compare them at reduced resolution."])
+        text = (
+            "Quality unknown: the areas with values in both orthos are too small to compare them at reduced resolution."
+        )
+        return "\n".join([*lines, text])
     lines.append(f"Quality at 1/{quality['ratio']} resolution:   ERGAS   angle   Q index")
     for name in ("sharpened", "upsampled"):
         row = quality[name]
