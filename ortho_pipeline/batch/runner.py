@@ -409,6 +409,7 @@ class _Mosaic:
                 Path(outcomes[job.name].files["ortho"]),
                 outcomes[job.name].facts["lean_m_per_m"],
                 _path_of(outcomes[job.name].files.get("accuracy")),
+                job.request.output.resampling,
             )
             for job in jobs
         ]

@@ -157,6 +157,19 @@ def oblong(folder: Path, name: str, column: int, row: int, size: tuple[int, int]
     return Ortho(name, path)
 
 
+@pytest.mark.parametrize("resampling", ["nearest", "bilinear"])
+def test_overviews_of_classes_have_classes(tmp_path, resampling):
+    """With the default of GDAL (cubic), classes 1 and 8 had values from 1 to 9."""
+    grid = Grid(UTM, 500000.0, 4e6, 2.0, 2.0, 600, 520)
+    classes = (np.random.default_rng(0).integers(0, 2, (1, 520, 600)) * 7 + 1).astype(np.uint8)
+    with RasterWriter(tmp_path / "a.tif", grid, Profile(1, np.dtype("uint8"), "nodata", 0.0), driver="GTiff") as writer:
+        writer.write(0, 0, classes, None)
+    write_cog(lay_out([Ortho("a", tmp_path / "a.tif", resampling=resampling)]), tmp_path / "m.tif")
+    mosaic = open_dataset(tmp_path / "m.tif")
+    overview = mosaic.GetRasterBand(1).GetOverview(0).ReadAsArray()
+    assert (set(np.unique(overview)) == {1, 8}) == (resampling == "nearest")
+
+
 def test_orthos_of_oblong_pixels_lie_where_their_corners_are(tmp_path):
     a = oblong(tmp_path, "a", 25, 20, (50, 45), (2.0, 3.0))
     b = oblong(tmp_path, "b", 0, 0, (40, 30), (2.0, 3.0))

@@ -208,5 +208,9 @@ def _names(paths: Sequence[Path]) -> list[str]:
 def _ortho(path: Path, name: str) -> Ortho:
     stem = path.stem.removesuffix(Path(ENDINGS["ortho"]).stem)
     report, accuracy = (path.with_name(f"{stem}{ENDINGS[kind]}") for kind in ("report", "accuracy"))
-    seen = read_report(report).scene.lean_m_per_m if report.is_file() else None
-    return Ortho(name, path, seen, accuracy if accuracy.is_file() else None)
+    lean, resampling = None, None
+    if report.is_file():
+        made = read_report(report)
+        lean = made.scene.lean_m_per_m
+        resampling = ((made.provenance.options or {}).get("output") or {}).get("resampling")
+    return Ortho(name, path, lean, accuracy if accuracy.is_file() else None, resampling)

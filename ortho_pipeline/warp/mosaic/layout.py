@@ -26,13 +26,15 @@ Box = tuple[int, int, int, int]
 class Ortho:
     """An orthoimage of a mosaic; `relief_displacement` per metre of height (m), None if unknown.
 
-    `accuracy` is the raster that `layers.accuracy` wrote of it.
+    `accuracy` is the raster that `layers.accuracy` wrote of it. `resampling` is how its pixels were made, None if
+    unknown.
     """
 
     name: str
     path: Path
     relief_displacement: float | None = None
     accuracy: Path | None = None
+    resampling: str | None = None
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,10 @@ def write_cog(
     profile, grid = Profile.of(opened[0].source), placed.grid
     fill = value_range(profile.dtype, profile)[3]
     clamped = shown = 0
-    with RasterWriter(path, grid, profile, threads=threads) as writer:
+    # Where the pixels of the orthos are not mixed, such as classes, overviews do not mix them either.
+    apart = all(layer.ortho.resampling == "nearest" for layer in placed.layers)
+    layout = {"OVERVIEW_RESAMPLING": "NEAREST"} if apart else {}
+    with RasterWriter(path, grid, profile, creation_options=layout, threads=threads) as writer:
         for left, top, width, height in windows(grid, _WINDOW):
             window = _Window(
                 left,
