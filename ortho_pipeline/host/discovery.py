@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import logging
 import os
@@ -15,6 +16,7 @@ from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.exchange.export import FORMATS
+from ortho_pipeline.files.shell import typed
 from ortho_pipeline.hookspecs import BlockFormat, Format, Scene, Sensor
 from ortho_pipeline.host.contract import scene_faults
 from ortho_pipeline.host.registry import Broken, Origin, Registry
@@ -206,7 +208,9 @@ class Host:
         if fault:
             raise PluginError(f"{self._name(chosen)}: {fault}", file=path, field="scene", remedy=_TEST_IT)
         log.info("%s: sensor %s, models %s from %s", path, chosen.name, ", ".join(scene.models), scene.model_source)
-        return placed(scene, dataset, crop_offset)
+        scene = placed(scene, dataset, crop_offset)
+        others = _other_images(dataset)
+        return dataclasses.replace(scene, warnings=(*scene.warnings, *others)) if others else scene
 
     def _recognises(self, sensor: Sensor, dataset: Any) -> bool:
         try:
@@ -220,6 +224,18 @@ class Host:
 
     def _name(self, sensor: Sensor) -> str:
         return f"sensor {sensor.name!r} of plugin {self._registry.owner[sensor.name]}"
+
+
+def _other_images(dataset: Any) -> tuple[str, ...]:
+    """Return a warning if GDAL opened the first of several images of a file: segments of NITF, pages of TIFF."""
+    names = [name for name, _ in dataset.GetSubDatasets()]
+    if len(names) < 2 or dataset.GetDriver().ShortName not in ("NITF", "GTiff"):
+        return ()
+    second = typed(f"{Path(dataset.GetDescription()).stem}_second.tif")
+    return (
+        f"the file has {len(names)} images; only the first is used. For the second: `gdal_translate {typed(names[1])} "
+        f"{second}`",
+    )
 
 
 def open_scene(

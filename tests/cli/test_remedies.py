@@ -441,6 +441,21 @@ def _palette(printed: Printed, folder: Path) -> None:
 # -- scenes, points and references -----------------------------------------------------------------------------------
 
 
+@case("host", "gdal_translate")
+def _of_several_images(printed: Printed, folder: Path) -> None:
+    rpc = gdal.Open(str(SAMPLE / "scene.tif")).GetMetadata("RPC")
+    for number, name in enumerate(("a strip.tif", "next.tif")):
+        image = gdal.Open(str(tiff(folder / name, GREY + number)), gdal.GA_Update)
+        image.SetMetadata(rpc, "RPC")
+        del image
+    gdal.Translate("a strip.tif", "next.tif", creationOptions=["APPEND_SUBDATASET=YES"])
+    (notice,) = [one for one in open_scene("a strip.tif").notices if "images" in one]
+    assert notice.startswith("the file has 2 images")
+    printed.paste(notice)
+    assert (open_dataset("a strip_second.tif").ReadAsArray() == GREY + 1).all()
+    assert not [one for one in open_scene("a strip_second.tif").notices if "images" in one]
+
+
 @case("host", "ortho sensors")
 def _sensors(printed: Printed, folder: Path) -> None:
     assert "ikonos" in printed.paste(refused(open_scene, SAMPLE / "scene.tif", "no-such"))
