@@ -157,6 +157,22 @@ def oblong(folder: Path, name: str, column: int, row: int, size: tuple[int, int]
     return Ortho(name, path)
 
 
+def test_the_command_for_another_grid_does_not_mix_palette_indices(tmp_path):
+    colours, orthos = gdal.ColorTable(), []
+    colours.SetColorEntry(1, (200, 100, 50))
+    for name, left in (("a", 500000.0), ("b", 500000.7)):
+        for table, kernel in ((None, "cubic"), (colours, "nearest")):
+            path = tmp_path / f"{name}_{kernel}.tif"
+            profile = Profile(1, np.dtype("uint8"), "nodata", 0.0, color_table=table)
+            with RasterWriter(path, Grid(UTM, left, 4e6, 2.0, 2.0, 20, 20), profile, driver="GTiff") as writer:
+                writer.write(0, 0, np.ones((1, 20, 20), dtype=np.uint8), None)
+            orthos.append(Ortho(f"{name} {kernel}", path))
+    for kernel in ("cubic", "nearest"):
+        with pytest.raises(InputError) as caught:
+            lay_out([ortho for ortho in orthos if ortho.name.endswith(kernel)])
+        assert f" -r {kernel} " in str(caught.value.remedy)
+
+
 @pytest.mark.parametrize("resampling", ["nearest", "bilinear"])
 def test_overviews_of_classes_have_classes(tmp_path, resampling):
     """With the default of GDAL (cubic), classes 1 and 8 had values from 1 to 9."""

@@ -150,9 +150,10 @@ def _regridded(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> str:
     box = " ".join(f"{value:.12g}" for value in extent)
     kept = _nodata_of(one)
     empty = "" if kept is None else f" -dstnodata {kept}"
+    kernel = "nearest" if RasterSource(other.path).palette else "cubic"
     return (
         f"{again}, or resample it: `ortho rectify {typed(other.path)} --ortho --height 0 -t_srs {':'.join(authority)} "
-        f"-tr {first.dx:.12g} {first.dy:.12g} -te {box} -r cubic{empty} -o regridded`"
+        f"-tr {first.dx:.12g} {first.dy:.12g} -te {box} -r {kernel}{empty} -o regridded`"
     )
 
 
