@@ -78,6 +78,8 @@ LOOKS = {
     "series-7": Look("check", None, 1.9, dash="2 3"),
     "series-8": Look("ink", None, 1.6, 0.75, dash="2 3"),
 }
+#: Width of a letter on average in a wide font, CSS px.
+_LETTER = 7.4
 _FONT = 'system-ui,-apple-system,"Segoe UI",Roboto,sans-serif'
 
 
@@ -112,6 +114,15 @@ class Drawing:
     ) -> None:
         """Write text at its baseline; `turn` writes upwards."""
         self.items.append(("text", {"x": x, "y": y, "text": text, "anchor": anchor, "quiet": quiet, "turn": turn}))
+
+    def caption(self, x: float, y: float, text: str, gap: float, *, left: bool, quiet: bool = False) -> None:
+        """Write a name to the left or right of `x`, on the other side where only that has room for it."""
+        size = gap + _LETTER * len(text)
+        fits_left, fits_right = x >= size, x + size <= self.width
+        if (left and fits_left) or (not fits_right and (fits_left or x > self.width / 2)):
+            self.text(x - gap, y, text, anchor="end", quiet=quiet)
+        else:
+            self.text(x + gap, y, text, quiet=quiet)
 
     @contextmanager
     def titled(self, title: str, *, key: int | None = None) -> Iterator[None]:

@@ -123,11 +123,8 @@ def _draw_point(drawing: Drawing, point: Drawn, at: Any, arrow: float, label: bo
         drawing.mark(kind, x, y)
         if label:
             # Next to the point, on the side that the arrow does not go to.
-            side, anchor = (-9, "end") if dx > 0 else (9, "start")
-            if x + side * 6 > drawing.width:
-                side, anchor = -9, "end"
             down = 4 if abs(dx) > abs(dy) else (-5 if dy > 0 else 12)
-            drawing.text(x + side, y + down, point.point.id, anchor=anchor, quiet=kind == "out")
+            drawing.caption(x, y + down, point.point.id, 9, left=dx > 0, quiet=kind == "out")
 
 
 def _title(shown: Drawn) -> str:

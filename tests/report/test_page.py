@@ -33,6 +33,7 @@ from ortho_pipeline.report.page import locator
 from ortho_pipeline.report.page.advice import WORDS, advised, signals
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
+from ortho_pipeline.report.plots import plot_residuals
 from ortho_pipeline.report.records import UNKNOWN, MapScaleRecord, SceneReport
 from ortho_pipeline.report.wording import NO_SCALE, few_check_points, fitness, scale_rules, verdict
 
@@ -361,3 +362,18 @@ def test_the_north_arrow_covers_no_point_and_names_stay_on_the_map(index):
                 assert math.hypot(item["x"] - north["x"], item["y"] - north["y"] - 26.0) > 30.0
             if kind == "text" and item["text"] in names:
                 assert 10.0 < item["y"] < drawing.height
+
+
+def test_long_names_are_not_cut_off_and_points_off_the_map_have_none():
+    said = made(measured())
+    left, bottom, right, top = said.ortho.extent
+    names = [f"road-junction-{k:03d}" for k in range(len(said.adjustment.points))]
+    points = tuple(one.replaced(id=name) for one, name in zip(said.adjustment.points, names, strict=True))
+    said = said.replaced(adjustment=said.adjustment.replaced(points=points))
+    west = said.replaced(ortho=said.ortho.replaced(extent=(left, bottom, (left + right) / 2, top)))
+    for drawing in (plot_residuals(said), plot_ortho(said), plot_ortho(west)):
+        shown = [given for what, given in drawing.items if what == "text" and given["text"] in names]
+        for given in shown:
+            size = 7.0 * len(given["text"])
+            assert given["x"] >= size if given["anchor"] == "end" else given["x"] + size <= drawing.width
+    assert 0 < len(shown) < len(names)

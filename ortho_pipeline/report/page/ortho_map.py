@@ -126,12 +126,11 @@ def _draw(drawing: Drawing, one: _Arrow, stretch: float, *, label: bool) -> None
             drawing.arrow(kind, x, y, dx, dy)
         drawing.circle("halo", x, y, 6.5)
         drawing.mark(kind, x, y)
-        if label:
-            beyond = x > drawing.width - 60
-            side = -10 if (dx > 0 or beyond) and x > 60 else 10
+        # A point off the map has no mark that a name could stand next to.
+        if label and 0 <= x <= drawing.width and 0 <= y <= drawing.height:
             # Of a point at the upper or lower edge the name stays on the map.
             line = min(max(y + (4 if abs(dx) > abs(dy) else -5), 14.0), drawing.height - 6.0)
-            drawing.text(x + side, line, one.point.id, anchor="end" if side < 0 else "start")
+            drawing.caption(x, line, one.point.id, 10, left=dx > 0)
 
 
 def _said(point: Point) -> str:
