@@ -244,10 +244,24 @@ def test_scenes_of_different_places_have_no_ties(tmp_path):
     with pytest.raises(InputError, match=r"no tie points found: scene0.tif and scene1.tif: ") as refused:
         tie([*views, other.view(views[0].surface)], TieSettings(search=25.0))
     assert "reference" not in str(refused.value)
+    assert "if the DEM covers only a part, fill the rest (`surface.fill`)" in str(refused.value.remedy)
     with pytest.raises(InputError, match=r"cannot match the scene with scene0.tif") as refused:
         refuse_accident(2, 20, 1.5, 1.0, [matching.OtherScene(views[0].intensity, views[0].model)], 25.0)
     assert "reference" not in str(refused.value)
     assert refused.value.field == "images"
+
+
+def test_images_without_heights_where_they_overlap_lead_to_filling_the_dem(tmp_path):
+    scenes, views = looks(tmp_path, [-5.0, 5.0], side=140)
+    dem = gdal.Open(str(scenes[0].dem_file), gdal.GA_Update)
+    heights = dem.ReadAsArray()
+    heights[:, : int(heights.shape[1] * 0.7)] = np.nan
+    dem.GetRasterBand(1).WriteArray(heights)
+    dem = None
+    partial = open_dem(scenes[0].dem_file, "ellipsoid")
+    with pytest.raises(InputError, match="no two of these images overlap") as refused:
+        tie([replace(view, surface=partial) for view in views], TieSettings(search=25.0))
+    assert "if the DEM covers only a part, fill the rest (`surface.fill`)" in str(refused.value.remedy)
 
 
 def test_resolutions_that_are_too_different_are_said_of_both_images(tmp_path):

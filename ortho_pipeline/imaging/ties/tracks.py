@@ -81,7 +81,12 @@ def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
             "no two of these images overlap: "
             + ", ".join(os.path.basename(view.intensity.source.path) for view in views[:_NAMED])
             + ("" if len(views) <= _NAMED else ", ..."),
-            remedy="give images that overlap; `ortho info IMAGE` shows where each is",
+            remedy=Text(
+                "give images that overlap (`ortho info IMAGE` shows where each is), or heights where they do: "
+                "if the DEM covers only a part, fill the rest (",
+                Setting("surface.fill"),
+                ")",
+            ),
         )
     block = _Block(views, targets, settings)
     for home, view in enumerate(views):
@@ -102,6 +107,8 @@ def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
                 Setting("match.search"),
                 "); if the DEM is coarse, state its accuracy (",
                 Setting("surface.sigma"),
+                "); if the DEM covers only a part, fill the rest (",
+                Setting("surface.fill"),
                 "); or measure tie points by hand",
             ),
         )
