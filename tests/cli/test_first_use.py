@@ -105,6 +105,18 @@ def test_outputs_are_no_inputs(folder):
     assert "scene_ortho.tif" not in survey(folder).of("dem")
 
 
+def test_a_folder_without_raw_images_is_not_asked_for_metadata(tmp_path):
+    (tmp_path / "scene_report.json").write_text("{}")
+    shutil.copy(SAMPLE / "reference.tif", tmp_path / "scene_ortho.tif")
+    assert "No scenes found. Outputs of ortho are not listed" in run("info", tmp_path).stdout
+    shutil.copy(SAMPLE / "reference.tif", tmp_path / "one.tif")
+    assert f"ortho verify {tmp_path / 'one.tif'} --reference ORTHO" in run("info", tmp_path).stdout
+    shutil.copy(SAMPLE / "reference.tif", tmp_path / "two.tif")
+    said = run("info", tmp_path).stdout
+    assert f"ortho verify {tmp_path / 'one.tif'} --reference {tmp_path / 'two.tif'}" in said
+    assert "No image has a sensor model" not in said
+
+
 def test_init_writes_a_file_that_a_run_takes(folder):
     done = run("init", folder)
     assert done.exit_code == 0, done.output

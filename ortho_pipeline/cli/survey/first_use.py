@@ -129,6 +129,19 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
     return None
 
 
+def _without_images(seen: FolderSurvey) -> list[str]:
+    """Return the next steps where no image is raw."""
+    maps = [os.path.join(seen.folder, name) for name in seen.of("map image")]
+    if not maps:
+        return ["No scenes found. Outputs of ortho are not listed; 'ortho info FILE' describes one."]
+    reference = maps[1:2] or ["ORTHO"]
+    line = shlex.join(["ortho", "verify", maps[0], "--reference", *reference])
+    return [
+        "The map images are finished orthos. Measure how accurate one is, with another one of the place:",
+        f"  {line}",
+    ]
+
+
 def next_steps(seen: FolderSurvey) -> list[str]:
     """Return the next steps for the files of a folder: sentences, and commands to paste."""
     from ortho_pipeline.commands.survey.folder import NO_DATUM
@@ -139,7 +152,9 @@ def next_steps(seen: FolderSurvey) -> list[str]:
         return os.path.join(seen.folder, name)
 
     if not scenes:
-        if images and seen.of("points"):
+        if not images:
+            return _without_images(seen)
+        if seen.of("points"):
             line = shlex.join(["ortho", "compare", at(images[0]), "--gcps", at(seen.of("points")[0])])
             return ["No image has a sensor model. Fit one to the points:", f"  {line}"]
         return ["No image has a sensor model. Put the metadata (RPC, DIMAP, .IMD ...) next to the image."]
