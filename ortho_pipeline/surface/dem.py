@@ -198,8 +198,8 @@ class DemSurface(Surface):
     cache_bytes : int
         Bytes of cached heights.
     sigma : float, Surface or None
-    raised : float
-        Added to the heights, m.
+    raised, least : float
+        Metres added to the heights. Heights below `least` are voids.
     """
 
     file: Samples
@@ -211,8 +211,8 @@ class DemSurface(Surface):
     cache_bytes: int
     sigma: float | Surface | None = None
     raised: float = 0.0
-    # What is kept follows from all of the above, so no two surfaces share it.
-    _tiles: TileCache = field(init=False, repr=False)
+    least: float = -math.inf
+    _tiles: TileCache = field(init=False, repr=False)  # follows from all of the above, so no two surfaces share it
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_tiles", TileCache(self.cache_bytes))
@@ -390,10 +390,10 @@ class DemSurface(Surface):
         split = min(width, self.shape[1] - first)
         heights = self.file.read(first, top, split, height, self.metres_per_unit)
         if split < width:
-            rest = self.file.read(0, top, width - split, height, self.metres_per_unit)
-            heights = np.concatenate([heights, rest], axis=1)
+            heights = np.hstack([heights, self.file.read(0, top, width - split, height, self.metres_per_unit)])
         if not self.vertical.is_ellipsoid:
             heights += _undulations(self.vertical, self.grid, (left, top, width, height))
+        heights[heights < self.least] = np.nan
         return heights + self.raised if self.raised else heights
 
     # -- ranges ------------------------------------------------------------------------------------------------------

@@ -62,3 +62,19 @@ def test_what_is_no_standard_deviation_is_refused(tiny, sigma):
     assert (caught.value.field, bool(caught.value.remedy)) == ("surface.sigma", True)
     with pytest.raises(InputError, match="none is given"):
         has_surface(SurfaceOptions(sigma=sigma))
+
+
+def test_negative_values_of_a_raster_are_voids_that_it_does_not_declare(tiny, quality):
+    layer = gdal.Open(str(quality), gdal.GA_Update)
+    values = layer.ReadAsArray()
+    values[values < 0], values[:20] = -99.0, -5.0
+    layer.GetRasterBand(1).DeleteNoDataValue()
+    layer.WriteArray(values)
+    layer = None
+    surface = open_surface(SurfaceOptions(dem=tiny.dem, vertical="ellipsoid", sigma=quality))
+    assert typical_sigma(surface) == pytest.approx(np.sqrt(5.0), rel=0.02)
+    rows, columns = surface.sigma.shape
+    heights = surface.sigma.window(0, 0, columns, rows)
+    assert np.isnan(heights[:20]).all()
+    assert np.isnan(heights[60:70, 40:50]).all()
+    assert np.nanmin(heights) == 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -117,7 +118,9 @@ def open_sigma(options: SurfaceOptions, scene: SceneOptions, memory: int) -> flo
     except (TypeError, ValueError):
         with completed(field="surface.sigma"):
             path = os.fspath(options.sigma)  # type: ignore[arg-type]
-            return open_dem(path, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
+            raster = open_dem(path, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
+        # Negative values are voids, declared or not.
+        return replace(raster, least=0.0)
     if 0 < number <= _LARGEST_SIGMA:
         return number
     raise InputError(

@@ -232,9 +232,9 @@ def write_layers(
     )
     if not result.known:
         raise InputError(
-            "the raster of height accuracy does not overlap the ortho",
+            "the raster of height accuracy has no value within the ortho",
             field="surface.sigma",
-            remedy="give a raster of this area, or a number",
+            remedy="give a raster of this area whose values are not negative, or a number",
         )
     layer = _record(result, known, output.layer_step)
     write_text(files["accuracy_style"], accuracy_style(layer))
