@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from ortho_pipeline.commands.heights.opening import require_geoid
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
@@ -81,6 +82,7 @@ def place_scene(resolved: Resolved) -> Placement:
     model, size = adjusted.model, (adjusted.scene.width, adjusted.scene.height)
     with completed(adjusted.scene.model_source, of="model"):
         footprint = lay(model, surface, *size)
+        require_geoid(footprint, model, size)
         footprint.require_coverage()
         model = footprint.fitted(model)
         grid = resolved.grid

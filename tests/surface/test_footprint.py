@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 import shapely
 
+from ortho_pipeline.commands.heights.opening import require_geoid
 from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.exchange.rpc import export_rpc
-from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models import RPC, FrameCamera, ImageCorrection
 from ortho_pipeline.models.frame.camera import MAP
 from ortho_pipeline.models.lens import Interior
@@ -320,3 +322,18 @@ def test_a_crs_whose_edge_crosses_the_scene_is_refused(crs: str, fits: bool) -> 
     with pytest.raises(InputError, match="crosses the scene") as caught:
         choose_grid(model, found, (WIDTH, HEIGHT), crs=parse_crs(crs), resolution=step)
     assert caught.value.field == "output.crs"
+
+
+def test_a_geoid_that_ends_within_the_scene_is_named_and_never_filled(tmp_path):
+    """The grid ends where the camera is; the DEM has heights everywhere."""
+    surface(tmp_path)
+    lon, lat, _ = ground_transform(CRS, "EPSG:4979")(np.array([[X, Y, 0.0]]))[0]
+    geoid = tmp_path / "half.gtx"
+    geoid.write_bytes(struct.pack(">4d2i4f", lat - 0.1, lon - 0.2, 0.2, 0.2, 2, 2, *[5.0] * 4))
+    for fill in ("error", "nearest", 80.0):
+        found = laid(drone(), open_dem(tmp_path / "dem.tif", str(geoid), fill=fill))
+        with pytest.raises(CoverageError, match=r"half.gtx does not cover 4\d.\d % of the scene") as caught:
+            require_geoid(found, drone(), (WIDTH, HEIGHT))
+        assert caught.value.field == "surface.vertical"
+    for surface_known in (open_dem(tmp_path / "dem.tif", str(geoid), fill="mask"), surface(tmp_path, west=0.0)):
+        require_geoid(laid(drone(), surface_known), drone(), (WIDTH, HEIGHT))

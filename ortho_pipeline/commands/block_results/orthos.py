@@ -11,6 +11,7 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands.control.points import no_points
+from ortho_pipeline.commands.heights.opening import require_geoid
 from ortho_pipeline.commands.mosaic.assembly import mosaic as mosaic_of
 from ortho_pipeline.commands.mosaic.assembly import mosaic_files
 from ortho_pipeline.commands.rectification import OrthoJob, make_ortho
@@ -93,6 +94,7 @@ def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOpt
     for label, scene in scenes.items():
         found = lay(scene.model, surface, scene.width, scene.height)
         try:
+            require_geoid(found, scene.model, (scene.width, scene.height))
             found.require_coverage()
         except CoverageError as error:
             outside[label] = error

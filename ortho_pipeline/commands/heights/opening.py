@@ -11,11 +11,13 @@ import numpy as np
 
 from ortho_pipeline.commands.heights.automatic import AUTO, extents_under, open_automatic
 from ortho_pipeline.commands.stac.given import heights_given
+from ortho_pipeline.display.numbers import share
 from ortho_pipeline.errors import CoverageError, InputError, completed, of_option
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions, number_of
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.cells.collected import open_collected
@@ -23,6 +25,7 @@ from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface, open_dem
 from ortho_pipeline.surface.dem_mosaic import matching_files
 from ortho_pipeline.surface.flat import FlatSurface
+from ortho_pipeline.surface.footprint import Footprint, image_grid
 
 #: Remedy where heights are missing.
 GIVE_HEIGHTS = Text(
@@ -36,6 +39,8 @@ GIVE_HEIGHTS = Text(
     Setting("surface.height", "METRES"),
     " above the ellipsoid for flat ground",
 )
+#: Places per side of the image at which the geoid is looked for.
+_GEOID_SIDE = 33
 #: No height is less certain (m) than that: the Earth has none of that size.
 _LARGEST_SIGMA = 10_000.0
 
@@ -99,6 +104,30 @@ def _require_same_place(surface: DemSurface, sigma: float | Surface | None) -> N
             file=sigma.files[0],
             field="surface.sigma",
             remedy="give the layer that belongs to this DEM, or one number of metres",
+        )
+
+
+def require_geoid(footprint: Footprint, model: SensorModel, size: tuple[int, int]) -> None:
+    """Raise a `CoverageError` if the DEM has heights under a scene where its geoid grid ends, and no pixels there.
+
+    With ``fill='mask'`` the ortho is empty there. Any other fill would replace heights that the DEM has.
+    """
+    surface = footprint.surface
+    if footprint.complete or not isinstance(surface, DemSurface) or surface.fill == "mask":
+        return
+    ground = model.image_to_ground(image_grid(*size, _GEOID_SIDE), footprint.middle)
+    known = surface.with_fill("mask")
+    stored = replace(known, vertical=Vertical.parse("ellipsoid")).heights(ground[:, :2], model.crs)
+    lost = np.isfinite(stored) & np.isnan(known.heights(ground[:, :2], model.crs))
+    if lost.any():
+        raise CoverageError(
+            f"{surface.vertical.label} does not cover {share(float(lost.mean()))} of the scene, but the DEM does",
+            file=surface.file.path,
+            field="surface.vertical",
+            remedy=Text(
+                "give the geoid grid of the whole scene, or leave these places empty with ",
+                Setting("surface.fill", "mask"),
+            ),
         )
 
 
