@@ -230,3 +230,30 @@ def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequenc
                         Setting("points.crs"),
                     ),
                 )
+
+
+def ground_sigmas(sigmas: Array, count: int) -> Array:
+    """Return standard deviations ``(count, 3)``, made from one value, one for each point, or three for all points.
+
+    Three are those true east, north and up.
+
+    Raises
+    ------
+    InputError
+        If the shape is none of these, or three values are as many as there are points.
+    """
+    each = sigmas.shape == (count,)
+    if each and count == 3 and np.ptp(sigmas) != 0:
+        raise InputError(
+            "three values for three points may be one for each point, or east, north and up",
+            field="sigma_ground",
+            remedy="give the shape (3, 1) for one for each point, or (1, 3) for east, north and up",
+        )
+    try:
+        return np.broadcast_to(sigmas[:, None] if each else sigmas, (count, 3))
+    except ValueError as error:
+        raise InputError(
+            f"sigma_ground has the shape {sigmas.shape}",
+            field="sigma_ground",
+            remedy=f"give one value, or the shape ({count},) or ({count}, 3)",
+        ) from error

@@ -27,7 +27,7 @@ from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.geodesy.naming import crs_definition
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of
-from ortho_pipeline.points.ground import ground_of
+from ortho_pipeline.points.ground import ground_of, ground_sigmas
 from ortho_pipeline.points.image_errors import (
     LAST_GROUP,
     checked_common,
@@ -151,7 +151,8 @@ class Points:
     ) -> Points:
         """Make points from arrays: `image` ``(N, 2)`` from the outer corner of the first pixel, `ground` ``(N, 3)``.
 
-        All other arguments are one value, or one for each point. Without `ids`, points are numbered from 1.
+        All other arguments are one value, or one for each point; `sigma_ground` also three for all, or three for each
+        point (east, north, up). Without `ids`, points are numbered from 1.
 
         Raises
         ------
@@ -164,8 +165,7 @@ class Points:
         <1 point: 1 control; WGS 84; arrays>
         """
         crs = parse_crs(crs)
-        heights = declared_vertical(crs)
-        if heights is not None and (heights.vertical is None or not heights.vertical.is_ellipsoid):
+        if (heights := declared_vertical(crs)) and not (heights.vertical and heights.vertical.is_ellipsoid):
             raise CrsError(
                 f"{crs.name!r} has heights above a geoid; points have them above the ellipsoid",
                 field="crs",
@@ -179,7 +179,7 @@ class Points:
             ground=_numbers("ground", ground),
             roles=np.full(count, roles) if np.size(roles) == 1 else np.array(roles),
             sigma_image=_numbers("sigma_image", sigma_image, (count,)),
-            sigma_ground=_numbers("sigma_ground", sigma_ground, (count, 3)),
+            sigma_ground=ground_sigmas(_numbers("sigma_ground", sigma_ground), count),
             crs=crs,
             source="arrays",
         )

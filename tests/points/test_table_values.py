@@ -58,6 +58,35 @@ def test_a_point_without_a_height_has_no_geocentric_place() -> None:
 
 
 @pytest.mark.parametrize(
+    ("sigmas", "expected"),
+    [
+        (0.2, np.full((4, 3), 0.2)),
+        ([1.0, 2.0, 3.0, 4.0], np.repeat([[1.0], [2.0], [3.0], [4.0]], 3, axis=1)),
+        ([[1.0], [2.0], [3.0], [4.0]], np.repeat([[1.0], [2.0], [3.0], [4.0]], 3, axis=1)),
+        ([1.0, 2.0, 3.0], np.tile([1.0, 2.0, 3.0], (4, 1))),
+        (np.arange(12.0).reshape(4, 3), np.arange(12.0).reshape(4, 3)),
+    ],
+)  # fmt: skip
+def test_sigmas_of_the_ground_are_those_of_all_points_of_each_or_of_each_axis(sigmas: Any, expected: Any) -> None:
+    ground = np.column_stack([24 + np.arange(4) / 10, np.full(4, -33.0), np.zeros(4)])
+    found = Points.of(np.arange(8.0).reshape(4, 2), ground, "EPSG:4979", sigma_ground=sigmas)
+    np.testing.assert_array_equal(found.sigma_ground, expected)
+    for wrong in ([1.0, 2.0], [1.0] * 5):
+        with pytest.raises(InputError, match="sigma_ground has the shape") as caught:
+            Points.of(found.image, ground, "EPSG:4979", sigma_ground=wrong)
+        assert "the shape (4,) or (4, 3)" in str(caught.value.remedy)
+
+
+def test_three_sigmas_for_three_points_are_refused_unless_equal_or_of_a_clear_shape() -> None:
+    image, ground = np.arange(6.0).reshape(3, 2), [[24.0, -33.0, 0.0], [24.1, -33.0, 0.0], [24.2, -33.0, 0.0]]
+    with pytest.raises(InputError, match="three values for three points"):
+        Points.of(image, ground, "EPSG:4979", sigma_ground=[1.0, 2.0, 3.0])
+    for clear in ([1.0, 1.0, 1.0], [[1.0], [2.0], [3.0]], [[1.0, 2.0, 3.0]]):
+        found = Points.of(image, ground, "EPSG:4979", sigma_ground=clear).sigma_ground
+        np.testing.assert_array_equal(found, np.broadcast_to(clear, (3, 3)))
+
+
+@pytest.mark.parametrize(
     ("names", "ids"),
     [
         (("b", "a"), ("b", "a")), (("b", "b"), ("1", "2")), (("", "a"), ("1", "2")), ((" b  c ", "a"), ("b c", "a")),
