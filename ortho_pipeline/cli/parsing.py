@@ -196,12 +196,14 @@ def _checked(ctx: click.Context, args: Sequence[str], params: Sequence[click.Par
         for name in (*param.opts, *param.secondary_opts)
     }
     words: list[str] = []
+    files: set[str | None] = set()
     rest = list(args)
     while rest:
         word = rest.pop(0)
         words.append(word)
         if word == "--":
             return words + rest
+        _refuse_second_file(ctx, word.partition("=")[0], known, files)
         option = known.get(word)
         if option is None:
             if word.startswith("--") and word.endswith("=") and word[:-1] in known:
@@ -216,6 +218,19 @@ def _checked(ctx: click.Context, args: Sequence[str], params: Sequence[click.Par
             _empty(ctx, word)
         words += taken
     return words
+
+
+def _refuse_second_file(
+    ctx: click.Context, name: str, known: Mapping[str, click.Option], files: set[str | None]
+) -> None:
+    """Fail if an option of one file is in `files` already, because click would use the last one; else add it there."""
+    option = known.get(name)
+    if option is None or option.multiple or not str(option.metavar).startswith("FILE"):
+        return
+    if option.name in files:
+        pattern = ". Name the files of one DEM by a pattern, such as 'cells/*.tif'" if name == "--dem" else ""
+        ctx.fail(f"'{name}' is given twice, and takes one file{pattern}.")
+    files.add(option.name)
 
 
 def _empty(ctx: click.Context, name: str) -> NoReturn:

@@ -127,3 +127,12 @@ def test_every_flag_of_a_command_has_a_name() -> None:
     assert "surface.dem" not in flags_of(command_of("run"))
     assert flags_of(command_of("adjust"))["points.model"] == "--model"
     assert "scene.model" not in flags_of(command_of("adjust"))
+
+
+@pytest.mark.parametrize("words", [("--dem", "a.tif", "--dem", "b.tif"), ("--dem=a.tif", "--dem", "a.tif")])
+def test_a_second_dem_is_refused_and_not_used_alone(tiny, words) -> None:
+    done = CliRunner().invoke(cli, ["rectify", str(tiny.image), *words])
+    assert done.exit_code == 2
+    assert "'--dem' is given twice, and takes one file. Name the files of one DEM by a pattern" in done.stderr
+    done = CliRunner().invoke(cli, ["rectify", str(tiny.image), "--dem", "a.tif", "--", "--dem", "b.tif"])
+    assert "twice" not in done.stderr
