@@ -3,7 +3,8 @@ r"""Forward intersection: the ground point that the rays of several images meet 
 For each point alone the sum of squares of :math:`(l_i - f_i(X)) / \sigma_i` over its rays is minimised, all points side
 by side. The covariance of a point is :math:`\sigma_0^2 (B^T B)^{-1}` with the weighted partials :math:`B` of its rays;
 errors of the models themselves are not in it (they are in that of an adjustment). With a redundancy below 4, rays can
-meet by chance: stated sigmas hold.
+meet by chance: stated sigmas hold. Points whose rays miss each other by far more than those of all others do not count
+for :math:`\sigma_0`: one gross error would scale the sigmas of all points.
 """
 
 from __future__ import annotations
@@ -20,14 +21,20 @@ from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.projection.rays import linearised
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.estimation.blunders import BLUNDER_RISK
 from ortho_pipeline.estimation.observations.arguments import refuse_other_model, refuse_other_points
 from ortho_pipeline.estimation.problem import LEAST_REDUNDANCY
+from ortho_pipeline.estimation.statistics import chance_of
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 
 #: Rays whose point is so many times less certain along its worst direction than along its best are parallel.
 PARALLEL = 3e3
 _STEPS = 30
+#: Smaller squares of a misfit over its sigma are those of rounded numbers.
+_ROUNDING = 1e-6
+#: Points beyond so many robust sigmas are tested against the others.
+_SUSPECT = 5.0
 #: A step beyond this (m) comes from a linearisation too far from the point.
 _LONGEST = 50_000.0
 
@@ -48,7 +55,9 @@ class Intersection:
     angles_deg : ndarray (N,)
         Largest angle between two rays of the point.
     sigma0 : float or None
-        Standard error of unit weight of all points together; None without redundancy.
+        Standard error of unit weight of all points together that do not contradict the others; None without redundancy.
+    contradicting : ndarray (N,)
+        Points whose rays miss each other by much more than those of all others. Their covariance has their own scale.
     """
 
     points: BlockPoints
@@ -57,6 +66,7 @@ class Intersection:
     residuals: Array
     angles_deg: Array
     sigma0: float | None
+    contradicting: np.ndarray
 
     def __repr__(self) -> str:
         met = int(np.isfinite(self.ground).all(axis=1).sum())
@@ -121,8 +131,11 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     residuals = points.measured - predict(frame, chosen, points, local)
     used = np.asarray(np.isfinite(residuals).all(axis=1))
     rays, of, misfit, partials = _equations(frame, chosen, points, used, local, np.arange(len(points)))
-    freedom = 2 * int(used.sum()) - 3 * int(found.sum())
-    sigma0 = math.sqrt(float((misfit**2).sum()) / freedom) if freedom > 0 else None
+    squares = _per_point(len(points), of, (misfit**2).sum(axis=1))
+    freedoms = np.where(found, 2 * np.bincount(of, minlength=len(points)) - 3, 0)
+    contradicting = _contradicting(squares, freedoms)
+    freedom = int(freedoms[~contradicting].sum())
+    sigma0 = math.sqrt(float(squares[~contradicting].sum()) / freedom) if freedom > 0 else None
     axes = frame.enu_at(places.geodetic)
     covariance = np.full((len(points), 3, 3), np.nan)
     normal = _per_point(len(points), of, partials.swapaxes(1, 2) @ partials)
@@ -131,11 +144,34 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     rows = np.zeros((points.rays, 2, 3))
     rows[rays] = partials
     if scaled and sigma0 is not None and freedom >= LEAST_REDUNDANCY:
-        covariance *= sigma0**2
+        covariance *= np.where(contradicting, squares / np.maximum(freedoms, 1), sigma0**2)[:, None, None]
     # Along a ray the image does not change: it is across both rows of the partials.
     directions = np.where(found[points.point, None], np.cross(rows[:, 0], rows[:, 1]), np.nan)
     one, _, angles = ray_angles(points.point, directions)
-    return Intersection(points, places.geodetic, covariance, residuals, largest_angles(points, one, angles), sigma0)
+    angles_deg = largest_angles(points, one, angles)
+    return Intersection(points, places.geodetic, covariance, residuals, angles_deg, sigma0, contradicting)
+
+
+def _contradicting(squares: Array, freedoms: Index) -> np.ndarray:
+    """Return which points have sums of squares ``(N,)`` that are too large, by those of all others.
+
+    Suspects are beyond five robust sigmas. The smallest is tested first, and counts from then on if it passes.
+    """
+    tested = freedoms > 0
+    out = np.zeros(len(squares), dtype=bool)
+    if freedoms.sum() <= LEAST_REDUNDANCY:
+        return out
+    size = np.maximum(freedoms, 1)
+    medians = size * (1 - 2 / (9 * size)) ** 3  # of chi-squared, by Wilson and Hilferty
+    typical = max(float(np.median((squares / medians)[tested])), _ROUNDING)
+    out[tested] = (squares / size)[tested] > _SUSPECT**2 * typical
+    for number in sorted(np.flatnonzero(out).tolist(), key=lambda k: squares[k] / size[k]):
+        others = float(freedoms[~out].sum())
+        unit = max(float(squares[~out & tested].sum()) / others, _ROUNDING)
+        if chance_of(squares[number] / unit, freedoms[number], others) < BLUNDER_RISK / tested.sum():
+            break
+        out[number] = False
+    return out
 
 
 def models_of(models: Mapping[str, SensorModel], points: BlockPoints) -> tuple[SensorModel, ...]:

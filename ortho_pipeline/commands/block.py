@@ -47,6 +47,7 @@ from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.commands.survey.folder import images_of
 from ortho_pipeline.display.notices import Notice, to_document
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.records import Rmse
@@ -232,7 +233,7 @@ def intersect(
     document = {
         "points": rows,
         "sigma0": intersection.sigma0,
-        **to_document([*notes, *_left_open(intersection)]),
+        **to_document([*notes, *_left_open(intersection), *_contradicting(intersection)]),
         "median_residual_px": _median_residual(intersection),
     }
     return Result(files, document, _intersection_text(document))
@@ -462,6 +463,18 @@ def _left_open(intersection: Intersection) -> list[Notice]:
         f"outside the models): {', '.join(names)}"
     )
     return [Notice("no-intersection", text, count=int(open_.sum()), points=names)]
+
+
+def _contradicting(intersection: Intersection) -> list[Notice]:
+    notices, points = [], intersection.points
+    for number in np.flatnonzero(intersection.contradicting)[:50].tolist():
+        largest = float(np.hypot(*intersection.residuals[points.point == number].T).max())
+        text = (
+            f"the rays of point {points.ids[number]} miss each other by much more than those of the other points "
+            f"(largest residual {significant(largest)} px); sigma0 is without it"
+        )
+        notices.append(Notice("contradicting-point", text, point=points.ids[number], role=str(points.roles[number])))
+    return notices
 
 
 def _intersection_text(document: Mapping[str, Any]) -> str:

@@ -213,3 +213,26 @@ def test_points_of_one_two_and_three_rays_weigh_by_covariances() -> None:
     assert np.isnan(found.residuals[points.point == 2]).all()
     assert np.isnan(found.angles_deg).tolist() == [False, False, True]
     assert repr(found) == f"<2 of 3 points intersected from 6 rays: sigma0 {found.sigma0:.3g}>"
+
+
+def test_a_gross_error_is_named_and_does_not_scale_the_sigmas_of_other_points() -> None:
+    """Forty points with errors of half a pixel, as stated; one measurement is wrong by 30 pixels."""
+    random = np.random.default_rng(3)
+    truth = random.uniform([500_100, 4_638_000, 100], [501_000, 4_639_900, 300], (40, 3))
+    ground = np.column_stack(TO_MAP.transform(*truth.T, direction="INVERSE"))
+    measured = np.concatenate([MODELS[name].ground_to_image(ground) for name in ("a", "b")])
+    points = BlockPoints(
+        ids=tuple(map(str, range(40))), ground=np.full((40, 3), np.nan), roles=np.array(["tie"] * 40),
+        sigma_ground=np.zeros((40, 3)), crs=pyproj.CRS(32633), images=("a", "b"), point=np.tile(np.arange(40), 2),
+        image=np.repeat([0, 1], 40), measured=measured + random.normal(0, 0.5, (80, 2)), sigma_image=np.full(80, 0.5),
+    )  # fmt: skip
+    models = {name: MODELS[name] for name in ("a", "b")}
+    clean = intersect(models, points)
+    assert not clean.contradicting.any()
+    points.measured[7, 1] += 30.0
+    found = intersect(models, points)
+    assert np.flatnonzero(found.contradicting).tolist() == [7]
+    assert found.sigma0 == pytest.approx(clean.sigma0, rel=0.05)
+    np.testing.assert_allclose(np.delete(found.sigmas, 7, 0), np.delete(clean.sigmas, 7, 0), rtol=0.05)
+    assert (found.sigmas[7] > 10 * clean.sigmas[7]).all()
+    assert not intersect(models, replace(points, measured=measured)).contradicting.any()
