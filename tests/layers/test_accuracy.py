@@ -210,14 +210,15 @@ def test_on_a_slope_errors_are_those_of_rays_that_meet_it(slope, tmp_path):
     np.testing.assert_allclose(found, np.sqrt(by_map[0, :2]), rtol=2e-3, atol=1e-4)
 
 
-def test_ground_that_a_ray_grazes_has_a_large_error_and_no_infinite_one():
+def test_the_error_of_steep_ground_has_limits():
+    """A ray that grazes the ground has no infinite one, and a wall that faces the sensor has half of it."""
     sight = Sight(Parallel(0.5, 0.0, 2.0, 256.0), City(()).grid())
     place = [np.array([value]) for value in (200.0, 300.0, FLOOR)]
     level, *steep = (
         parts_at(Budget(heights=1.0), sight, *place, slopes=np.array([[slope, 0.1]])).heights[0, 0]
-        for slope in (0.0, 1.6, 2.0, 30.0)
+        for slope in (0.0, 1.6, 2.0, 30.0, -2.0, -30.0)
     )
-    np.testing.assert_allclose(np.array(steep) / level, 25.0, rtol=1e-5)
+    np.testing.assert_allclose(np.array(steep) / level, [25.0, 25.0, 25.0, 0.25, 0.25], rtol=1e-5)
 
 
 def test_the_same_error_everywhere_is_that_of_the_scene(tmp_path):

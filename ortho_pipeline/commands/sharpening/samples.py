@@ -1,9 +1,9 @@
 """Samples of two orthos on one coarse grid, and the weights of the multispectral bands in the panchromatic one.
 
-The panchromatic pixels are averaged to the multispectral pixel size. Those of the highest value may be saturated, as on
-clouds, where the bands are brighter than they show, so they take no part. GDAL divides by the weighted sum of the
-bands, so the regression has no constant; a constant would change the brightness. Weights are not negative, as
-sensitivities are.
+The panchromatic pixels are averaged to the multispectral pixel size. On clouds and roofs they may be saturated, where
+the bands are brighter than they show: most of the brightest have one value then, and take no part. GDAL divides by the
+weighted sum of the bands, so the regression has no constant; a constant would change the brightness. Weights are not
+negative, as sensitivities are.
 
 Source: Lawson and Hanson 1974 (non-negative least squares).
 """
@@ -30,6 +30,8 @@ _SIDE, _VALUES = 128, 3_000_000
 _REDUCED = 8
 #: Fewest pixels with a value in both orthos, for each weight.
 _FEWEST = 10
+#: Part of all pixels that are saturated, at least.
+_SATURATED = 1e-3
 
 
 class Sample(NamedTuple):
@@ -97,11 +99,8 @@ def regress(samples: Sequence[Sample], count: int) -> Weights:
         panchromatic one.
     """
     valid = [np.isfinite(sample.pan) & np.isfinite(sample.colours).all(axis=0) for sample in samples]
-    highest = max(
-        (sample.pan[good].max() for sample, good in zip(samples, valid, strict=True) if good.any()), default=0
-    )
-    below = [good & (sample.pan < highest) for sample, good in zip(samples, valid, strict=True)]
-    # An even image has no pixels of another value.
+    limit = _saturation(np.concatenate([sample.pan[good] for sample, good in zip(samples, valid, strict=True)]))
+    below = [good & (sample.pan < limit) for sample, good in zip(samples, valid, strict=True)]
     used = below if sum(map(np.count_nonzero, below)) >= _FEWEST * count else valid
     normal, right = np.zeros((count, count)), np.zeros(count)
     pixels, total, squares = 0, 0.0, 0.0
@@ -150,3 +149,14 @@ def _non_negative(normal: Array, right: Array) -> Array:
     design = (vectors * root).T[kept]
     observed = (vectors.T @ (right / scale))[kept] / root[kept]
     return np.asarray(optimize.nnls(design, observed)[0] / scale)
+
+
+def _saturation(pan: NDArray[np.float32]) -> float:
+    """Return the value above the median that most pixels as bright or brighter have; infinity without one.
+
+    Interpolation makes a few pixels beside a saturated area brighter than it.
+    """
+    values, counts = np.unique(pan, return_counts=True)
+    brighter = counts[::-1].cumsum()[::-1]
+    found = (2 * counts >= brighter) & (brighter >= _SATURATED * len(pan)) & (brighter < len(pan) / 2)
+    return float(values[found][0]) if found.any() else np.inf

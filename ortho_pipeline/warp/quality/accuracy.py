@@ -16,8 +16,8 @@ and north), the covariance of the place that it really shows is
 - :math:`\sigma_h, \sigma_0`: standard deviations of the heights and of their datum;
 - :math:`\sigma_r`: of the place of a reference that points were matched with, where :math:`C_p` does not have it;
 - :math:`T`: a ray that is off meets a slope higher or lower. Errors are smaller on slopes that face the sensor, and
-  larger on those that turn away from it. Along the view the factor is :math:`1 / (1 + s \cdot d)`. Where a ray grazes
-  the ground it has no limit; it is taken for 1 / `LEAST` at most.
+  larger on those that turn away from it. Along the view the factor is :math:`1 / (1 + s \cdot d)`, within the limits
+  1 / `MOST` and 1 / `LEAST`.
 
 Assumed is that the parts are independent, that the model follows the scene but for its parameters, and that the slope
 is even over the error. The parts are interpolated between nodes that are exact, to `_TOLERANCE`.
@@ -42,7 +42,7 @@ from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
 from ortho_pipeline.warp.quality import accuracy_kernel
-from ortho_pipeline.warp.quality.accuracy_kernel import LEAST, Nodes, PixelHeights
+from ortho_pipeline.warp.quality.accuracy_kernel import LEAST, MOST, Nodes, PixelHeights
 from ortho_pipeline.warp.quality.error_ellipse import circular_error, circular_error_of_all, radii
 from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.tile_kernel import DemWindow
@@ -190,7 +190,8 @@ def parts_at(
     if slopes is None:
         return parts
     along = (slopes * nodes[:, 3:5]).sum(axis=1, keepdims=True)
-    slopes = slopes * np.where(along < LEAST - 1.0, (LEAST - 1.0) / np.minimum(along, LEAST - 1.0), 1.0)
+    limited = np.clip(along, LEAST - 1.0, MOST - 1.0)
+    slopes = slopes * np.divide(limited, along, out=np.ones_like(along), where=limited != along)
     matrix = np.linalg.inv(np.eye(2) + nodes[:, 3:5, None] * slopes[:, None, :])
     return Parts(*(_three(matrix @ _square(part) @ matrix.transpose(0, 2, 1)) for part in parts))
 

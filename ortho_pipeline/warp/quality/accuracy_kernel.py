@@ -11,8 +11,9 @@ from ortho_pipeline.warp.tile_kernel import DemWindow, dem_height_at
 
 #: Fields of a node: model (ee, nn, en), displacement (e, n), interpolation (ee, nn, en), image (column, row).
 _FIELDS = 10
-#: A ray grazes the ground if the way to it along the view grows by more than one over this.
-LEAST = 0.2
+#: Limits of 1 + s . d. Below, a ray grazes the ground; above are walls and noise of a surface model, which are too short
+#: for their slope to hold over an error.
+LEAST, MOST = 0.2, 2.0
 
 
 class Nodes(NamedTuple):
@@ -147,8 +148,8 @@ def _turned(values, slopes, c):
     """Return how an error on level ground is one on a slope: a matrix, row by row."""
     east, north, to_east, to_north = values[3, c], values[4, c], slopes[0, c], slopes[1, c]
     along = to_east * east + to_north * north
-    limited = max(along, LEAST - 1.0)
-    factor = (limited / along if limited > along else 1.0) / (1.0 + limited)
+    limited = min(max(along, LEAST - 1.0), MOST - 1.0)
+    factor = (limited / along if limited != along else 1.0) / (1.0 + limited)
     return (
         1.0 - east * to_east * factor, -east * to_north * factor,
         -north * to_east * factor, 1.0 - north * to_north * factor,
