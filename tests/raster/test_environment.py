@@ -82,6 +82,41 @@ def test_the_command_line_ignores_them() -> None:
     assert done.stdout == "False\n"
 
 
+_AS_COMMAND_LINE = "from ortho_pipeline.cli.program import _begin; _begin()\n"
+_OPEN = "import sys; from ortho_pipeline.raster.source import open_dataset; image = open_dataset(sys.argv[1])\n"
+
+
+def test_options_of_a_gdalrc_do_not_reach_the_command_line(tmp_path: Path) -> None:
+    """Places moved by half a pixel without a word."""
+    path = _image(tmp_path / "image.tif")
+    expected = open_dataset(path).GetGeoTransform()
+    settings = tmp_path / "gdalrc"
+    settings.write_text("[configoptions]\nGTIFF_POINT_GEO_IGNORE=TRUE\n")
+    script = _AS_COMMAND_LINE + _OPEN + "print(image.GetGeoTransform())"
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)],
+        env={**os.environ, "GDAL_CONFIG_FILE": str(settings)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == f"{expected}\n"
+    assert "GTIFF_POINT_GEO_IGNORE=TRUE is ignored" in done.stderr
+
+
+def test_options_that_a_program_sets_are_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """They are those of the program, which a library leaves alone."""
+    path = _image(tmp_path / "image.tif")
+    gdal.SetConfigOption("GDAL_JPEG_TO_RGB", "NO")
+    try:
+        open_dataset(path)
+        open_dataset(path)
+        assert gdal.GetConfigOption("GDAL_JPEG_TO_RGB") == "NO"
+    finally:
+        gdal.SetConfigOption("GDAL_JPEG_TO_RGB", None)
+    assert caplog.text.count("GDAL_JPEG_TO_RGB=NO is set in this process") == 1
+
+
 def test_a_folder_without_the_database_of_proj_is_named(tmp_path: Path) -> None:
     """A DEM with a height datum was refused because it had none, and then the error was called a bug."""
     script = (

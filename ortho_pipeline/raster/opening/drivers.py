@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 import re
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from osgeo import gdal, osr
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import network_is_closed
 from ortho_pipeline.files.shell import typed
+from ortho_pipeline.raster.opening.environment import CHANGING
 
 gdal.UseExceptions()
 
@@ -80,6 +82,7 @@ _BEGINNINGS = {
 }
 _ENDINGS = {".til": "TIL", ".hgt": "SRTMHGT", ".ers": "ERS", ".pix": "PCIDSK"}
 _BEGINNING = 4096
+log = logging.getLogger(__name__)
 
 
 @functools.cache
@@ -90,6 +93,26 @@ def remove_network_drivers() -> None:
             driver = gdal.GetDriverByName(name)
             if driver is not None:
                 driver.Deregister()
+
+
+def see_to_reading_options() -> None:
+    """Unset options that change what GDAL reads, such as those of a gdalrc file; other processes get a warning only."""
+    for name in CHANGING:
+        value = gdal.GetConfigOption(name)
+        if value is None:
+            continue
+        ours = network_is_closed()
+        if ours:
+            gdal.SetConfigOption(name, None)
+        _warn_of_option(name, value, ours)
+
+
+@functools.cache
+def _warn_of_option(name: str, value: str, ours: bool) -> None:
+    if ours:
+        log.warning("GDAL's option %s=%s is ignored: it changes what GDAL reads", name, value)
+    else:
+        log.warning("GDAL's option %s=%s is set in this process: it changes what GDAL reads", name, value)
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""Variables of the environment by which GDAL reads other pixels, heights or places from the same files."""
+"""Options of GDAL by which it reads other pixels, heights or places from the same files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import os
 
 #: Without them GDAL reads what the files state, and reports what it cannot read.
-_CHANGING = (
+CHANGING = (
     "CONVERT_YCBCR_TO_RGB",  # colours
     "DTED_APPLY_PIXEL_IS_POINT",  # half a pixel
     "GDAL_DISABLE_READDIR_ON_OPEN",  # masks, RPCs, nodata values next to an image
@@ -28,7 +28,7 @@ def ignore_reading_options() -> None:
 
     For a process of the command line, before it loads GDAL: a library leaves the environment of its host alone.
     """
-    for name in _CHANGING:
+    for name in CHANGING:
         if name in os.environ:
             value = os.environ.pop(name)
             log.warning("the environment variable %s=%s is ignored: it changes what GDAL reads", name, value)
