@@ -117,6 +117,27 @@ def test_options_that_a_program_sets_are_a_warning(tmp_path: Path, caplog: pytes
     assert caplog.text.count("GDAL_JPEG_TO_RGB=NO is set in this process") == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("GDAL_SKIP", "COG", "GDAL_SKIP: GDAL has no driver COG"),
+        ("GDAL_SKIP", "MEM,DTED", "GDAL_SKIP: GDAL has no driver MEM"),
+        ("GDAL_CACHEMAX", "-5", "GDAL_CACHEMAX: GDAL cannot use this size of its cache: -5"),
+    ],
+)
+def test_options_with_which_gdal_cannot_work_are_named(tmp_path: Path, name: str, value: str, message: str) -> None:
+    """They were called bugs of this package, some after the ortho had been made."""
+    script = (
+        "import sys; from ortho_pipeline.errors import InputError\n"
+        "from ortho_pipeline.raster.source import open_dataset\n"
+        "try: open_dataset(sys.argv[1])\n"
+        "except InputError as error: print(error)\n"
+    )
+    words = [sys.executable, "-c", script, str(_image(tmp_path / "image.tif"))]
+    done = subprocess.run(words, env={**os.environ, name: value}, capture_output=True, text=True, check=True)
+    assert message in done.stdout
+
+
 def test_a_folder_without_the_database_of_proj_is_named(tmp_path: Path) -> None:
     """A DEM with a height datum was refused because it had none, and then the error was called a bug."""
     script = (

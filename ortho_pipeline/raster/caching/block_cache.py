@@ -8,6 +8,8 @@ from contextlib import contextmanager
 
 from osgeo import gdal
 
+from ortho_pipeline.raster.opening.drivers import require_usable_gdal
+
 #: Bytes that GDAL's cache needs in addition to large blocks of an image.
 _OTHER_BLOCKS = 64_000_000
 
@@ -44,6 +46,7 @@ class _Jobs:
 @contextmanager
 def cache_restored() -> Iterator[None]:
     """Give the process the size of its cache back when the last job that is under way has ended."""
+    require_usable_gdal()
     with _Jobs.lock:
         if not _Jobs.count:
             _Jobs.before = gdal.GetCacheMax()

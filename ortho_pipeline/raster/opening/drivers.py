@@ -82,6 +82,8 @@ _BEGINNINGS = {
 }
 _ENDINGS = {".til": "TIL", ".hgt": "SRTMHGT", ".ers": "ERS", ".pix": "PCIDSK"}
 _BEGINNING = 4096
+#: What outputs, reports and work in memory are written with.
+_WRITING = ("GTiff", "COG", "VRT", "PNG", "MEM")
 log = logging.getLogger(__name__)
 
 
@@ -113,6 +115,34 @@ def _warn_of_option(name: str, value: str, ours: bool) -> None:
         log.warning("GDAL's option %s=%s is ignored: it changes what GDAL reads", name, value)
     else:
         log.warning("GDAL's option %s=%s is set in this process: it changes what GDAL reads", name, value)
+
+
+@functools.cache
+def require_usable_gdal() -> None:
+    """Refuse rasters if GDAL lacks a driver that every command may need, or cannot use the size of its cache.
+
+    Raises
+    ------
+    InputError
+    """
+    missing = [name for name in _WRITING if gdal.GetDriverByName(name) is None]
+    if missing:
+        skipped = gdal.GetConfigOption("GDAL_SKIP")
+        raise InputError(
+            f"GDAL has no driver {', '.join(missing)}",
+            field="GDAL_SKIP" if skipped else None,
+            remedy=f"remove {', '.join(missing)} from GDAL's option GDAL_SKIP (now {skipped!r})"
+            if skipped
+            else f"use a GDAL that was built with it; this is {gdal.__version__}",
+        )
+    try:
+        gdal.GetCacheMax()
+    except RuntimeError as error:
+        raise InputError(
+            f"GDAL cannot use this size of its cache: {gdal.GetConfigOption('GDAL_CACHEMAX')}",
+            field="GDAL_CACHEMAX",
+            remedy="unset it, or give megabytes (512) or a share of the memory (5%)",
+        ) from error
 
 
 @functools.cache

@@ -36,6 +36,7 @@ from ortho_pipeline.raster.opening.drivers import (
     remove_network_drivers,
     require_driver,
     require_proj_database,
+    require_usable_gdal,
     see_to_reading_options,
 )
 from ortho_pipeline.raster.opening.references import NAMES_OF, Named, crs_texts, products_of_volume, to_one_file
@@ -87,6 +88,7 @@ def open_seen(
     gdal.UseExceptions()  # other code of the process may have turned them off since the import
     see_to_reading_options()
     remove_network_drivers()
+    require_usable_gdal()
     require_proj_database()
     if siblings:
         ask_beside(path, allow_network=True)
