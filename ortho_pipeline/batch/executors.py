@@ -17,6 +17,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.synchronize import Event
 from queue import SimpleQueue
 from typing import Any, TypeVar, cast
 
@@ -105,33 +106,45 @@ class Processes:
             # A pool whose own threads fail to begin is waited for without end.
             require_memory()
             startable_threads(2)
+            spawning = _Spawning(self._spawned)
+            began = spawning.Event()
             self._pool = ProcessPoolExecutor(
                 min(self.workers, ahead),
-                mp_context=_Spawning(self._spawned),
-                initializer=start_worker,
-                initargs=(self.threads,),
+                mp_context=spawning,
+                initializer=_begin_worker,
+                initargs=(began, self.threads),
             )
             for job, future in _completed(self._pool, ahead, work, jobs, ended):
                 broken = broken or isinstance(future.exception(), BrokenExecutor)
                 yield job, future
             # Nothing is under way any more; an interpreter takes its time to end by itself.
-            self.stop()
+            codes = self.stop()
+            # Python ends with this code if its script raises, and a signal with another.
+            if broken and 1 in codes and not began.is_set():
+                raise InputError(
+                    "no worker process can begin: each one runs the script that called this function again",
+                    field="executor",
+                    remedy="call the function only under `if __name__ == '__main__':`, in a script that is a file; "
+                    "or set executor='sequential'",
+                )
 
-    def stop(self) -> None:
-        """End all processes; unfinished scenes have no outputs, and remove their temporary files."""
+    def stop(self) -> list[int | None]:
+        """End all processes, and return their exit codes; unfinished scenes have no outputs or temporary files."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
         started = [process for process in self._spawned if _is_started(process)]
         for process in started:
             with contextlib.suppress(ValueError):
                 process.terminate()
-        until = time.monotonic() + _LEAVE
+        until, codes = time.monotonic() + _LEAVE, []
         for process in started:
             with contextlib.suppress(ValueError):
                 process.join(max(0.0, until - time.monotonic()))
                 # A signal reaches a job only between two calls of compiled code.
                 process.kill()
+                codes.append(process.exitcode)
         self._spawned.clear()
+        return codes
 
 
 def _is_started(process: SpawnProcess) -> bool:
@@ -247,6 +260,11 @@ class _Spawning(SpawnContext):
         process = SpawnProcess(*args, **kwargs)
         self._spawned.append(process)
         return process
+
+
+def _begin_worker(began: Event, threads: int) -> None:
+    began.set()
+    start_worker(threads)
 
 
 def start_worker(threads: int) -> None:
@@ -383,12 +401,8 @@ def _died(future: Future[Outcome]) -> Future[Outcome]:
     failed: Future[Outcome] = Future()
     failed.set_exception(
         WorkerDied(
-            "a worker process ended before its work was done",
-            remedy=Text(
-                "give it more memory, or ",
-                Setting("workers", "1"),
-                '; in a Python script, put the call below the line if __name__ == "__main__":',
-            ),
+            "the process of this scene was killed",
+            remedy=Text("give it more memory, or ", Setting("workers", "1")),
         )
     )
     return failed

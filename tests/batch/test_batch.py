@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from ortho_pipeline.batch import config as batch_config
 from ortho_pipeline.batch import freshness
 from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch import runner as batch
-from ortho_pipeline.batch.executors import InGroups, Processes, WorkerDied, _died, _Spawning, completed
+from ortho_pipeline.batch.executors import InGroups, Processes, WorkerDied, _Spawning, completed
 from ortho_pipeline.batch.records import RunRecord, locked
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.resolved.ledger import versions
@@ -677,14 +677,22 @@ def test_a_process_that_dies_takes_only_its_own_job_along():
     assert {job: future.result() for job, future in ended.items()} == {"1 + 1": 2, "2 * 2": 4, budget: "3"}
 
 
-def test_processes_that_could_not_be_started_do_not_hide_why():
-    """In a script without a main guard, a worker may not start processes: they are known, and none was started."""
+def test_a_process_that_was_never_started_needs_no_end():
     crew = Processes(1, 1)
     _Spawning(crew._spawned).Process(target=print)
-    crew.stop()
-    dead: Future[None] = Future()
-    dead.set_exception(BrokenExecutor())
-    assert "__main__" in str(_died(dead).exception().remedy)
+    assert crew.stop() == []
+
+
+def test_a_script_that_runs_again_in_each_worker_is_told_so(tmp_path):
+    """The remedy was more memory, or one worker, which did not help either."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from ortho_pipeline.batch.executors import Processes, completed\n"
+        "print([future.exception() for _, future in completed(Processes(1, 1), eval, ['1'])])\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "call the function only under `if __name__ == '__main__':`" in done.stderr
 
 
 def test_a_scene_of_which_others_have_the_lock_is_made_once(block):
