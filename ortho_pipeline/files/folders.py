@@ -9,11 +9,13 @@ from __future__ import annotations
 import bisect
 import os
 import re
+import stat
 import time
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import AnyPath, VsiPath
 
 #: A folder that was changed less than so long ago (s) may be changed again within the same tick of its clock.
@@ -130,3 +132,27 @@ def listing(folder: AnyPath) -> Listing:
 def _state(folder: str | os.PathLike[str]) -> _State:
     stat = os.stat(folder)
     return stat.st_dev, stat.st_ino, stat.st_ctime_ns, stat.st_mtime_ns
+
+
+def require_replaceable(path: Path) -> None:
+    """Refuse an output in place of a device, or of a file that only its owner may replace.
+
+    Raises
+    ------
+    InputError
+    """
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise InputError(
+            "this is a device, a pipe or a socket; outputs do not replace it",
+            file=path,
+            remedy="choose another path",
+        )
+    if os.name == "nt" or not os.path.lexists(path):
+        return
+    folder, file = os.stat(path.parent), os.lstat(path)
+    if folder.st_mode & stat.S_ISVTX and os.geteuid() not in (0, folder.st_uid, file.st_uid):
+        raise InputError(
+            "this file belongs to another user, and in this folder only owners may replace files (sticky bit)",
+            file=path,
+            remedy="choose another folder, or let its owner remove it",
+        )

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.folders import require_replaceable
 from ortho_pipeline.files.locks import Lock
 from ortho_pipeline.files.reading import read_bounded
 
@@ -184,12 +185,7 @@ class Outputs:
                 file=final,
                 remedy="remove or rename it",
             )
-        if os.path.exists(final) and not os.path.isfile(final):
-            raise InputError(
-                "this is a device, a pipe or a socket; outputs do not replace it",
-                file=final,
-                remedy="choose another path",
-            )
+        require_replaceable(final)
         try:
             if len(os.fsencode(final.name)) > os.pathconf(final.parent, "PC_NAME_MAX"):
                 raise InputError("this name is too long for the file system", file=final, remedy="rename the image")

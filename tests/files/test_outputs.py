@@ -222,3 +222,14 @@ def test_a_lock_of_bytes_waits_until_it_is_free(
     assert len(pauses) == 3
     for lock in (first, second):
         lock.close()
+
+
+def test_a_file_that_only_its_owner_may_replace_leaves_all_outputs_as_they_were(tmp_path, monkeypatch) -> None:
+    """In a folder such as /tmp the first outputs were new and the others old."""
+    (tmp_path / "a.txt").write_text("old")
+    tmp_path.chmod(0o1777)
+    monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 1)
+    with pytest.raises(InputError, match="belongs to another user"), together(tmp_path, "set"):
+        write_text(tmp_path / "a.txt", "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "old"
