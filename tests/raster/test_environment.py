@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.opening.environment import ignore_reading_options
 from ortho_pipeline.raster.source import open_dataset
 
@@ -152,3 +153,10 @@ def test_a_folder_without_the_database_of_proj_is_named(tmp_path: Path) -> None:
     done = subprocess.run(words, env=surroundings, capture_output=True, text=True, check=True)
     assert f"{tmp_path}: PROJ_LIB: GDAL cannot use the database of PROJ" in done.stdout
     assert "Remedy: remove the environment variable PROJ_LIB" in done.stdout
+
+
+def test_a_name_that_is_not_utf_8_is_the_reason(tmp_path: Path) -> None:
+    """The remedy was another format."""
+    path = _image(tmp_path / "image.tif").rename(tmp_path / os.fsdecode(b"image\xff.tif"))
+    with pytest.raises(InputError, match="rename the file or its folder"):
+        open_dataset(path)

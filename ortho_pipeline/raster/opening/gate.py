@@ -85,6 +85,12 @@ def open_seen(
     RuntimeError
         If GDAL cannot open the file.
     """
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(
+            "GDAL cannot open this name, which is not UTF-8", file=path, remedy="rename the file or its folder"
+        ) from error
     gdal.UseExceptions()  # other code of the process may have turned them off since the import
     see_to_reading_options()
     remove_network_drivers()

@@ -11,7 +11,7 @@ from ortho_pipeline.warp.tile_kernel import DemWindow, dem_height_at
 
 #: Fields of a node: model (ee, nn, en), displacement (e, n), interpolation (ee, nn, en), image (column, row).
 _FIELDS = 10
-#: Limits of 1 + s . d. Below, a ray grazes the ground; above are walls and noise of a surface model, which are too short
+#: Limits of 1 + s . d. Below, a ray grazes the ground. Above are walls and noise of a surface model, too short
 #: for their slope to hold over an error.
 LEAST, MOST = 0.2, 2.0
 
