@@ -23,6 +23,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile, as_written, keep_off_nodata, value_range
+from ortho_pipeline.raster.pixel_types import gdal_type
 from ortho_pipeline.raster.regridded import coarser, part_of, warped_bounds
 from ortho_pipeline.raster.source import Grid, RasterSource, first_line
 
@@ -162,7 +163,7 @@ class Pansharpened:
         # GDAL's bindings read whole pixels.
         first, upper = left // factor, top // factor
         columns, rows = -(-(left + width) // factor) - first, -(-(top + height) // factor) - upper
-        colours = self._read(wide, (first, upper, columns, rows), factor)
+        colours = self._smooth(wide, (first, upper, columns, rows), factor)
         inset = slice(top - upper * factor, None), slice(left - first * factor, None)
         colours = colours[: self._colours.count, *inset][:, :height, :width]
         valid = (pan != _EMPTY) & (colours != _EMPTY).all(axis=0)
@@ -181,16 +182,30 @@ class Pansharpened:
             keep_off_nodata(out, np.broadcast_to(valid, out.shape), fill, low)
         return out
 
-    def _read(self, dataset: gdal.Dataset, window: tuple[int, int, int, int], factor: int = 1) -> NDArray[Any]:
-        """Return a window, upsampled by a factor."""
-        columns, rows = window[2] * factor, window[3] * factor
+    def _smooth(self, dataset: gdal.Dataset, window: tuple[int, int, int, int], factor: int) -> NDArray[Any]:
+        """Return a window of a warped dataset, upsampled by a factor.
+
+        GDAL 3.13 warps such a dataset again for another size, with the nearest pixels. So they are read first.
+        """
+        left, top, width, height = window
+        first, upper = max(left - _REACH, 0), max(top - _REACH, 0)
+        last, lower = min(left + width + _REACH, dataset.RasterXSize), min(top + height + _REACH, dataset.RasterYSize)
+        pixels = _in_memory(self._read(dataset, (first, upper, last - first, lower - upper)))
+        return np.asarray(
+            pixels.ReadAsArray(
+                left - first, top - upper, width, height,
+                buf_xsize=width * factor, buf_ysize=height * factor, resample_alg=gdal.GRIORA_Cubic,
+            )
+        ).reshape(-1, height * factor, width * factor)  # fmt: skip
+
+    def _read(self, dataset: gdal.Dataset, window: tuple[int, int, int, int]) -> NDArray[Any]:
         try:
-            pixels = dataset.ReadAsArray(*window, buf_xsize=columns, buf_ysize=rows, resample_alg=gdal.GRIORA_Cubic)
+            pixels = dataset.ReadAsArray(*window)
         except RuntimeError as error:
             raise InputError(
                 f"GDAL cannot sharpen this ortho ({first_line(error)})", file=self._pan.path, remedy="make it again"
             ) from error
-        return np.asarray(pixels).reshape(-1, rows, columns)
+        return np.asarray(pixels).reshape(-1, window[3], window[2])
 
     def _all_valid(self, left: int, top: int, width: int, height: int) -> bool:
         """Return whether all pixels of a window and those that the upsampling needs about it are valid."""
@@ -276,15 +291,14 @@ def upsampled(colours: NDArray[np.float32], rows: int, columns: int) -> NDArray[
 
     NaN without a value; holes of one pixel get values from their neighbours.
     """
-    dataset = _in_memory(colours, 1.0)
+    dataset = _in_memory(colours)
     return _marked(dataset.ReadAsArray(buf_xsize=columns, buf_ysize=rows, resample_alg=gdal.GRIORA_Cubic))
 
 
-def _in_memory(pixels: NDArray[np.float32], size: float) -> gdal.Dataset:
+def _in_memory(pixels: NDArray[Any]) -> gdal.Dataset:
     count, rows, columns = pixels.shape
-    dataset = gdal.GetDriverByName("MEM").Create("", columns, rows, count, gdal.GDT_Float32)
-    dataset.SetGeoTransform((0.0, size, 0.0, rows * size, 0.0, -size))
-    dataset.WriteArray(np.where(np.isfinite(pixels), pixels, np.float32(_EMPTY)))
+    dataset = gdal.GetDriverByName("MEM").Create("", columns, rows, count, gdal_type(pixels.dtype))
+    dataset.WriteArray(np.where(np.isfinite(pixels), pixels, pixels.dtype.type(_EMPTY)))
     for number in range(count):
         dataset.GetRasterBand(number + 1).SetNoDataValue(_EMPTY)
     return dataset

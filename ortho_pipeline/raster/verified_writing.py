@@ -346,7 +346,7 @@ def require_writable(driver: str, options: Mapping[str, str], count: int, code: 
     except RuntimeError as error:
         raise InputError(
             f"GDAL cannot write {counted(count, 'band')} of {gdal.GetDataTypeName(code)} with these creation options "
-            f"({first_line(error).replace(f'{place}: ', '')})",
+            f"({first_line(error).replace(f'{place}: ', '').replace(f'{place.name}: ', '')})",
             field="creation option",
             remedy="correct the creation options, or leave them out",
         ) from error

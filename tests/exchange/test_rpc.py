@@ -821,7 +821,13 @@ def test_a_side_car_that_gdal_cannot_read_is_named(tmp_path):
         rpc_of_dataset(dataset)
 
 
-@pytest.mark.parametrize(("driver", "ending"), [("ENVI", "img"), ("EHdr", "bil")])
+@pytest.mark.parametrize(
+    ("driver", "ending"),
+    [
+        pytest.param("ENVI", "img", marks=pytest.mark.driver("ENVI")),
+        pytest.param("EHdr", "bil", marks=pytest.mark.driver("EHdr")),
+    ],
+)
 def test_the_rpc_of_an_image_with_its_header_in_another_file(tmp_path, driver, ending):
     made = gdal.Open(str(make_image(tmp_path / "made.tif", make_rpc())))
     path = str(tmp_path / f"scene.{ending}")

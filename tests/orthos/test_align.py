@@ -133,7 +133,7 @@ def test_without_resampling_no_pixel_is_touched(shifted, tmp_path, form):
     assert not document["resampled"]
 
 
-def test_a_moved_copy_keeps_what_is_in_side_cars(tmp_path):
+def test_a_moved_copy_keeps_what_is_in_side_cars(tmp_path, monkeypatch):
     """Its mask, its CRS and its place; the pixels are those of the original."""
     pixels = np.arange(2400, dtype=np.uint16).reshape(40, 60)
     made = gdal.GetDriverByName("GTiff").Create(
@@ -143,6 +143,7 @@ def test_a_moved_copy_keeps_what_is_in_side_cars(tmp_path):
     made.SetProjection(parse_crs("EPSG:32636").to_wkt())
     made.WriteArray(pixels)
     made.GetRasterBand(1).SetDescription("nir")
+    monkeypatch.setenv("GDAL_TIFF_INTERNAL_MASK", "NO")
     made.CreateMaskBand(gdal.GMF_PER_DATASET)
     made.GetRasterBand(1).GetMaskBand().WriteArray(np.where(pixels % 60 < 30, 255, 0).astype(np.uint8))
     del made

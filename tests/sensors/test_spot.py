@@ -175,6 +175,7 @@ def test_metadata_of_the_images_own_name_come_first(scene: Path) -> None:
     assert open_scene(next(scene.glob("*.TIF")).rename(scene / "SCENE.TIF")).model_source == str(own)
 
 
+@pytest.mark.driver("DIMAP")
 def test_every_command_takes_the_folder(scene: Path) -> None:
     info = used(scene, read_spot(scene / "METADATA.DIM").model, SIZE, sensor="spot", height=300.0,
                 correction="model")  # fmt: skip
