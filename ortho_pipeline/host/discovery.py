@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed, described
-from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.exchange.export import FORMATS
 from ortho_pipeline.files.shell import typed
@@ -233,8 +233,8 @@ def _other_images(dataset: Any) -> tuple[str, ...]:
         return ()
     second = typed(f"{Path(dataset.GetDescription()).stem}_second.tif")
     return (
-        f"the file has {len(names)} images; only the first is used. For the second: `gdal_translate {typed(names[1])} "
-        f"{second}`",
+        f"the file has {counted(len(names), 'image')}; only the first is used. For the second: "
+        f"`gdal_translate {typed(names[1])} {second}`",
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -129,6 +129,15 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
     return None
 
 
+def _without_models(seen: FolderSurvey, images: Sequence[str]) -> list[str]:
+    """Return the next steps where no raw image has a sensor model."""
+    if not (points := seen.of("points")):
+        return ["No image has a sensor model. Put the metadata (RPC, DIMAP, .IMD ...) next to the image."]
+    files = [os.path.join(seen.folder, name) for name in (images[0], points[0])]
+    line = shlex.join(["ortho", "compare", files[0], "--gcps", files[1]])
+    return ["No image has a sensor model. Fit one to the points:", f"  {line}"]
+
+
 def _without_images(seen: FolderSurvey) -> list[str]:
     """Return the next steps where no image is raw."""
     maps = [os.path.join(seen.folder, name) for name in seen.of("map image")]
@@ -152,12 +161,7 @@ def next_steps(seen: FolderSurvey) -> list[str]:
         return os.path.join(seen.folder, name)
 
     if not scenes:
-        if not images:
-            return _without_images(seen)
-        if seen.of("points"):
-            line = shlex.join(["ortho", "compare", at(images[0]), "--gcps", at(seen.of("points")[0])])
-            return ["No image has a sensor model. Fit one to the points:", f"  {line}"]
-        return ["No image has a sensor model. Put the metadata (RPC, DIMAP, .IMD ...) next to the image."]
+        return _without_models(seen, images) if images else _without_images(seen)
     dems, points, maps = (seen.beside(scenes[0], kind) for kind in _KINDS)
     notes, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
     if not dems:

@@ -114,8 +114,8 @@ def regress(samples: Sequence[Sample], count: int) -> Weights:
     every = sum(sample.pan.size for sample in samples)
     if every < _FEWEST * count:
         raise InputError(
-            f"the orthos have {counted(every, 'multispectral pixel')} in common; the weights of {count} bands need "
-            f"{_FEWEST * count}",
+            f"the orthos have {counted(every, 'multispectral pixel')} in common; the weights of "
+            f"{counted(count, 'band')} need {_FEWEST * count}",
             field="ratio",
             remedy=Text("give larger orthos, or a smaller ", Setting("ratio")),
         )
