@@ -39,6 +39,7 @@ def test_aerial_orthos_see_the_same_displacement_of_each_other(homonim):
     assert (np.abs(bias_of(there) + bias_of(back)) < limit).all()
 
 
+@pytest.mark.slow
 def test_landsat_and_an_aerial_ortho_see_the_same_displacement_of_each_other(homonim):
     landsat, aerial = homonim / "landsat8_byte.tif", homonim / AERIAL[1]
     there = verify(aerial, match=MatchOptions(reference=[str(landsat)])).document

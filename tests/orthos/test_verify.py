@@ -175,6 +175,7 @@ def test_a_bent_ortho_is_matched_again_unless_the_caller_wants_one_matching(bent
     assert calls[1] < calls[0]
 
 
+@pytest.mark.slow
 def test_an_ortho_upside_down_is_refused_unless_it_is_searched(shifted, tmp_path):
     turned = tmp_path / "turned.tif"
     source = gdal.Open(str(shifted[0]))
