@@ -85,6 +85,12 @@ def test_the_command_line_ignores_them() -> None:
 
 _AS_COMMAND_LINE = "from ortho_pipeline.cli.program import _begin; _begin()\n"
 _OPEN = "import sys; from ortho_pipeline.raster.source import open_dataset; image = open_dataset(sys.argv[1])\n"
+_REFUSED = (
+    "import sys; from ortho_pipeline.errors import InputError\n"
+    "from ortho_pipeline.raster.source import open_dataset\n"
+    "try: open_dataset(sys.argv[1])\n"
+    "except InputError as error: print(error)\n"
+)
 
 
 def test_options_of_a_gdalrc_do_not_reach_the_command_line(tmp_path: Path) -> None:
@@ -128,26 +134,14 @@ def test_options_that_a_program_sets_are_a_warning(tmp_path: Path, caplog: pytes
 )
 def test_options_with_which_gdal_cannot_work_are_named(tmp_path: Path, name: str, value: str, message: str) -> None:
     """They were called bugs of this package, some after the ortho had been made."""
-    script = (
-        "import sys; from ortho_pipeline.errors import InputError\n"
-        "from ortho_pipeline.raster.source import open_dataset\n"
-        "try: open_dataset(sys.argv[1])\n"
-        "except InputError as error: print(error)\n"
-    )
-    words = [sys.executable, "-c", script, str(_image(tmp_path / "image.tif"))]
+    words = [sys.executable, "-c", _REFUSED, str(_image(tmp_path / "image.tif"))]
     done = subprocess.run(words, env={**os.environ, name: value}, capture_output=True, text=True, check=True)
     assert message in done.stdout
 
 
 def test_a_folder_without_the_database_of_proj_is_named(tmp_path: Path) -> None:
     """A DEM with a height datum was refused because it had none, and then the error was called a bug."""
-    script = (
-        "import sys; from ortho_pipeline.errors import InputError\n"
-        "from ortho_pipeline.raster.source import open_dataset\n"
-        "try: open_dataset(sys.argv[1])\n"
-        "except InputError as error: print(error)\n"
-    )
-    words = [sys.executable, "-c", script, str(_image(tmp_path / "image.tif"))]
+    words = [sys.executable, "-c", _REFUSED, str(_image(tmp_path / "image.tif"))]
     surroundings = {**os.environ, "PROJ_LIB": str(tmp_path)}
     surroundings.pop("PROJ_DATA", None)
     done = subprocess.run(words, env=surroundings, capture_output=True, text=True, check=True)

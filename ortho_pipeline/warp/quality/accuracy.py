@@ -19,8 +19,8 @@ and north), the covariance of the place that it really shows is
   larger on those that turn away from it. Along the view the factor is :math:`1 / (1 + s \cdot d)`, within the limits
   1 / `MOST` and 1 / `LEAST`.
 
-Assumed is that the parts are independent, that the model follows the scene but for its parameters, and that the slope
-is even over the error. The parts are interpolated between nodes that are exact, to `_TOLERANCE`.
+Three assumptions: the parts are independent; the model is right apart from its parameters; the slope is even over the
+error. The parts are interpolated between nodes that are exact, to `_TOLERANCE`.
 """
 
 from __future__ import annotations
