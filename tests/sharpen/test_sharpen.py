@@ -165,7 +165,9 @@ def test_drawn_bundles_are_better_than_upsampling(seed: int, tmp_path: Path) -> 
     # Brovey multiplies all bands of a pixel by one number, so the angle can change by rounding only.
     assert angle == pytest.approx(same, abs=0.02)
     side = wide.shape[1] // ratio * ratio
-    quality = reduced_quality([Sample(sample.pan[:side, :side], wide[:, :side, :side])], weights.values, ratio)
+    quality = reduced_quality(
+        [Sample(sample.pan[:side, :side], wide[:, :side, :side])], weights.values, ratio, np.dtype(np.float32)
+    )
     if quality is not None:
         assert quality["sharpened"]["ergas"] < quality["upsampled"]["ergas"]
 
@@ -338,7 +340,7 @@ def test_a_large_ratio_has_a_quality_and_one_too_large_is_named() -> None:
         grid = Grid(pyproj.CRS("EPSG:32636"), 0.0, 0.0, 20.0, 20.0, side, side)
         return read_samples(image(wide.mean(axis=0)[None]), image(wide), (1, 2, 3, 4), grid, ratio)
 
-    quality = reduced_quality(samples_of(200, 20), [0.25] * 4, 20)
+    quality = reduced_quality(samples_of(200, 20), [0.25] * 4, 20, np.dtype(np.float32))
     assert quality is not None
     assert quality["pixels"] >= 1600
     with pytest.raises(InputError, match="9 multispectral pixels in common; the weights of 4 bands need 40") as caught:

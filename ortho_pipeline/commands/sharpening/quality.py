@@ -22,7 +22,7 @@ _RIM = 3
 
 
 def reduced_quality(
-    samples: Iterable[Sample], weights: Sequence[float], ratio: int, dtype: np.dtype[Any] | None = None
+    samples: Iterable[Sample], weights: Sequence[float], ratio: int, dtype: np.dtype[Any]
 ) -> dict[str, Any] | None:
     """Return the quality of sharpened and of upsampled windows as JSON values; None if the orthos are too small.
 
@@ -36,8 +36,7 @@ def reduced_quality(
             continue
         # Where one pixel has no value, the mean has none.
         coarse = colours.reshape(len(colours), rows, ratio, columns, ratio).mean(axis=(2, 4))
-        smooth = upsampled(coarse, *pan.shape)
-        smooth = smooth if dtype is None else within(smooth, dtype)
+        smooth = within(upsampled(coarse, *pan.shape), dtype)
         images = {"sharpened": brovey(pan, smooth, weights), "upsampled": smooth}
         rim = _RIM * ratio
         part = (slice(rim, -rim), slice(rim, -rim))
