@@ -362,9 +362,9 @@ def as_heights(heights: ArrayLike, count: int) -> Array:
 
 def as_numbers(values: ArrayLike, what: str) -> Array:
     """Return values as contiguous float64; NaN where a masked array has none."""
-    if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(np.float64), np.nan)
     try:
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(np.float64), np.nan)
         return np.asarray(values, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} is no array of numbers ({error})", field=what) from error
