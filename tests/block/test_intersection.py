@@ -215,7 +215,7 @@ def test_points_of_one_two_and_three_rays_weigh_by_covariances() -> None:
     assert repr(found) == f"<2 of 3 points intersected from 6 rays: sigma0 {found.sigma0:.3g}>"
 
 
-def test_a_gross_error_is_named_and_does_not_scale_the_sigmas_of_other_points() -> None:
+def test_gross_errors_are_named_and_do_not_scale_the_sigmas_of_other_points() -> None:
     """Forty points with errors of half a pixel, as stated; one measurement is wrong by 30 pixels."""
     random = np.random.default_rng(3)
     truth = random.uniform([500_100, 4_638_000, 100], [501_000, 4_639_900, 300], (40, 3))
@@ -235,4 +235,8 @@ def test_a_gross_error_is_named_and_does_not_scale_the_sigmas_of_other_points() 
     assert found.sigma0 == pytest.approx(clean.sigma0, rel=0.05)
     np.testing.assert_allclose(np.delete(found.sigmas, 7, 0), np.delete(clean.sigmas, 7, 0), rtol=0.05)
     assert (found.sigmas[7] > 10 * clean.sigmas[7]).all()
+    points.measured[[3, 12, 20, 31], 1] += 30.0
+    several = intersect(models, points)
+    assert np.flatnonzero(several.contradicting).tolist() == [3, 7, 12, 20, 31]
+    assert several.sigma0 == pytest.approx(clean.sigma0, rel=0.1)
     assert not intersect(models, replace(points, measured=measured)).contradicting.any()

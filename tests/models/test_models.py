@@ -206,6 +206,22 @@ def test_a_pole_beyond_the_box_and_what_is_behind_it_are_nan_without_a_warning(c
     np.testing.assert_array_equal(np.isfinite(image[:, 0]), ground[:, 0] < 25.125)
 
 
+@pytest.mark.parametrize("count", [2, COMPILED_FROM])
+def test_no_ground_is_found_behind_a_pole_of_one_axis(count):
+    """The columns have a pole at y = 1/0.7; behind it the ratios are finite, too."""
+    rest = [0.0] * 17
+    model = make_rpc(
+        col_num=[0.0, 1.0, -0.5, *rest], col_den=[1.0, 0.0, -0.7, *rest],
+        row_num=[0.0, 0.2, -1.0, *rest], row_den=[1.0, 0.0, 0.0, *rest],
+    )  # fmt: skip
+    y, x = np.array([1.40, 1.455]), 0.707
+    ratios = np.column_stack([(x - 0.5 * y) / (1.0 - 0.7 * y), 0.2 * x - y])
+    image = np.resize(ratios * [model.col_scale, model.row_scale] + [model.col_off, model.row_off], (count, 2))
+    ground = model.image_to_ground(image, 700.0)
+    np.testing.assert_array_equal(np.isfinite(ground[:, 0]), np.resize([True, False], count))
+    np.testing.assert_allclose(ground[::2, 1], model.lat_off + 1.40 * model.lat_scale, atol=1e-9)
+
+
 def test_heights_are_gated_like_longitude_and_latitude():
     model = make_rpc()
     heights = model.h_off + model.h_scale * np.array([-4.0, -1.51, -1.49, 0.0, 1.49, 1.51, 4.0])

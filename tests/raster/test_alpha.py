@@ -72,13 +72,16 @@ def test_two_files_with_an_alpha_band_each_have_a_mask(tmp_path):
     np.testing.assert_array_equal(valid, np.broadcast_to(pixels[3] > 0, (8, SIDE, SIDE)))
 
 
-@pytest.mark.parametrize(("data", "doubtful"), [(True, True), (False, False)])
-def test_an_alpha_band_with_data_is_doubted(tmp_path, data, doubtful):
+@pytest.mark.parametrize(("alpha", "doubtful"), [("data", True), ("edge", False), ("as it is", False)])
+def test_an_alpha_band_with_data_is_doubted(tmp_path, alpha, doubtful):
     """GDAL takes the fourth of four bands of bytes for alpha, such as near infrared."""
     pixels = write(tmp_path / "image.tif")
     made = gdal.Open(str(tmp_path / "image.tif"), gdal.GA_Update)
-    if data:
+    if alpha == "data":
         made.GetRasterBand(4).WriteArray(pixels[0] // 2)
+    if alpha == "edge":
+        # Opaque, with a soft edge of as many levels as an image has.
+        made.GetRasterBand(4).WriteArray(np.minimum(np.arange(SIDE) * 15, 255)[:, None] * np.ones((1, SIDE), np.uint8))
     del made
     rectified(tmp_path)
     report = json.loads((tmp_path / "o" / "image_report.json").read_text())

@@ -10,6 +10,7 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.errors import CrsError
+from ortho_pipeline.raster import stored_crs
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
 
@@ -50,6 +51,18 @@ def corner(path: Path) -> tuple[float, float]:
     found = pyproj.CRS.from_wkt(dataset.GetProjection())
     lon, lat, *_ = pyproj.Transformer.from_crs(found, "EPSG:4326", always_xy=True).transform(left, top)
     return lon, lat
+
+
+def test_systems_are_the_same_if_their_places_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Newer codes of EPSG come back from a file as other texts."""
+    grid = grid_at("EPSG:32636", 33.1, 37.1)
+    stored_wkt, given_back = stored_crs.stored_wkt.__wrapped__, stored_crs._given_back
+    wanted = stored_wkt(grid)
+    monkeypatch.setattr(stored_crs, "same_crs", lambda one, other: False)
+    assert stored_wkt(grid) == wanted
+    monkeypatch.setattr(stored_crs, "_given_back", lambda text: given_back(pyproj.CRS("EPSG:32635").to_wkt()))
+    with pytest.raises(CrsError, match="cannot store"):
+        stored_wkt(grid)
 
 
 @pytest.mark.parametrize(("crs", "lon", "lat"), [("EPSG:8857", 10.0, 50.0), ("EPSG:9311", -100.0, 40.0)])
