@@ -59,6 +59,19 @@ def test_options_that_change_what_is_read_are_ignored_with_a_warning(tmp_path, m
     assert option in caplog.text
 
 
+def test_the_defaults_of_gdal_are_no_reason_for_a_warning(monkeypatch, caplog) -> None:
+    """`GDAL_PAM_ENABLED=YES`, GDAL's default, was called a change of what GDAL reads."""
+    names = {"GDAL_PAM_ENABLED": "YES", "GDAL_DISABLE_READDIR_ON_OPEN": "false", "GTIFF_IGNORE_READ_ERRORS": "0"}
+    for name, value in names.items():
+        monkeypatch.setenv(name, value)
+    ignore_reading_options()
+    assert not caplog.text
+    monkeypatch.setenv("GDAL_DISABLE_READDIR_ON_OPEN", "EMPTY_DIR")
+    monkeypatch.setenv("GTIFF_REPORT_COMPD_CS", "YES")
+    ignore_reading_options()
+    assert caplog.text.count("is ignored") == 2
+
+
 def test_damaged_blocks_are_errors_whatever_the_environment(tmp_path, monkeypatch) -> None:
     """GDAL returned what was in its memory."""
     path = _image(tmp_path / "image.tif")

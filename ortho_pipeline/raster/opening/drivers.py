@@ -15,7 +15,7 @@ from osgeo import gdal, osr
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import network_is_closed
 from ortho_pipeline.files.shell import typed
-from ortho_pipeline.raster.opening.environment import CHANGING
+from ortho_pipeline.raster.opening.environment import CHANGING, changes_reading
 
 gdal.UseExceptions()
 
@@ -101,7 +101,7 @@ def see_to_reading_options() -> None:
     """Unset options that change what GDAL reads, such as those of a gdalrc file; other processes get a warning only."""
     for name in CHANGING:
         value = gdal.GetConfigOption(name)
-        if value is None:
+        if not changes_reading(name, value):
             continue
         ours = network_is_closed()
         if ours:
