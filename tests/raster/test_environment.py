@@ -143,6 +143,7 @@ def test_options_that_a_program_sets_are_a_warning(tmp_path: Path, caplog: pytes
         ("GDAL_SKIP", "COG", "GDAL_SKIP: GDAL has no driver COG"),
         ("GDAL_SKIP", "MEM,DTED", "GDAL_SKIP: GDAL has no driver MEM"),
         ("GDAL_CACHEMAX", "-5", "GDAL_CACHEMAX: GDAL cannot use this size of its cache: -5"),
+        ("GDAL_CACHEMAX", "foo", "GDAL_CACHEMAX: GDAL cannot use this size of its cache: foo"),
     ],
 )
 def test_options_with_which_gdal_cannot_work_are_named(tmp_path: Path, name: str, value: str, message: str) -> None:

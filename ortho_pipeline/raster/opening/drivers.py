@@ -135,14 +135,18 @@ def require_usable_gdal() -> None:
             if skipped
             else f"use a GDAL that was built with it; this is {gdal.__version__}",
         )
+    size = gdal.GetConfigOption("GDAL_CACHEMAX", "5%")
     try:
         gdal.GetCacheMax()
-    except RuntimeError as error:
+        usable = size.lstrip()[:1].isdigit()  # GDAL 3.6 takes other texts as 0
+    except RuntimeError:
+        usable = False
+    if not usable:
         raise InputError(
-            f"GDAL cannot use this size of its cache: {gdal.GetConfigOption('GDAL_CACHEMAX')}",
+            f"GDAL cannot use this size of its cache: {size}",
             field="GDAL_CACHEMAX",
             remedy="unset it, or give megabytes (512) or a share of the memory (5%)",
-        ) from error
+        )
 
 
 @functools.cache
