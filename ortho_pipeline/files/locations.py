@@ -27,8 +27,7 @@ from ortho_pipeline.files.traffic import count_gdal
 WEB = {"https": "/vsicurl/https://", "http": "/vsicurl/http://"}
 #: Schemes of stores, whose objects are also listed and written.
 STORES = {"s3": "/vsis3/", "gs": "/vsigs/", "az": "/vsiaz/"}
-#: All schemes of URLs that are read.
-SCHEMES = WEB | STORES
+SCHEMES = WEB | STORES  # of all URLs that are read
 _ARCHIVES = ("/vsizip", "/vsitar", "/vsigzip", "/vsi7z", "/vsirar")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 #: An address of a folder or an object.
@@ -45,8 +44,7 @@ _SIGNED = re.compile(
     r"header\.[\w-]*|\w*userpwd)=",
     re.IGNORECASE,
 )
-#: The token of a page of answers opens none.
-_PAGE = re.compile(r"(?<=[?&])token=[^&]*", re.IGNORECASE)
+_PAGE = re.compile(r"(?<=[?&])token=[^&]*", re.IGNORECASE)  # the token of a page of answers opens none
 _SHOWN, _MOST_ENCODED = 5, 5
 #: No more is read at once of a file in an archive or behind a URL: a zip of 1 kB may hold billions of zeros.
 MAX_READ = 5_000_000
@@ -59,6 +57,8 @@ def check_path(path: str | os.PathLike[str]) -> str:
     import difflib
 
     place = Path(path)
+    if any(mark in str(place) for mark in "*?["):
+        return "list the files, or write the pattern without quotes, so that the shell expands it"
     if not place.parent.is_dir():
         return f"check the path: there is no folder '{place.parent}'"
     with contextlib.suppress(OSError), os.scandir(place.parent) as listed:

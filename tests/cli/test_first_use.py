@@ -190,5 +190,12 @@ def test_a_file_that_is_not_there_suggests_the_one_most_like_it(folder, words, m
     assert f"did you mean '{folder / meant}'?" in done.stderr
 
 
+def test_a_pattern_in_quotes_is_called_one(tmp_path):
+    """There was "no folder 'west*'"."""
+    done = run("mosaic", tmp_path / "west*" / "*.tif", "-o", tmp_path / "mosaic.tif")
+    assert done.exit_code == 2
+    assert "write the pattern without quotes" in done.stderr
+
+
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     assert "there is no folder" in run("info", tmp_path / "none" / "scene.tif").stderr
