@@ -113,7 +113,7 @@ class OutputOptions:
             "Memory for windows and caches, in MB or with a unit, such as 2GB.",
             "MB",
             kind="bytes",
-            above=999_999,
+            above=15_999_999,
             in_file=False,
         ),
     ] = 512_000_000

@@ -17,8 +17,9 @@ from ortho_pipeline.cli import flags
 from ortho_pipeline.cli.flags import as_typed
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import rectify
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.options import SurfaceOptions
+from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -241,6 +242,14 @@ def test_without_its_alpha_band_an_ortho_has_a_mask(tiny, tmp_path):
 def test_memory_is_megabytes_or_bytes(monkeypatch, text, size):
     assert given_output(monkeypatch, "-wm", text).memory == size
     assert run("rectify", "a.tif", "-o", "out", "-wm", "8").exit_code == 2
+
+
+def test_the_least_memory_is_the_same_in_python_and_on_the_command_line(monkeypatch):
+    """Python took 1 MB, less than the smallest cache that a job has."""
+    assert OutputOptions(memory=16_000_000) == given_output(monkeypatch, "-wm", "16")
+    assert "too little" in run("rectify", "a.tif", "-o", "out", "-wm", "15").stderr
+    with pytest.raises(InputError, match=r"output\.memory"):
+        OutputOptions(memory=15_999_999)
 
 
 # -- overwriting -----------------------------------------------------------------------------------------------------
