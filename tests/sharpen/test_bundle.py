@@ -134,4 +134,9 @@ def test_wrong_options_are_refused_before_any_work(tmp_path: Path) -> None:
         assert message in result.output
     result = run("rectify", colours, "--sharpen", pan, *out)
     assert "panchromatic image has one" in result.output
+    coarse = write(tmp_path / "coarse.tif", np.zeros((1, 8, 8)), 40.0)
+    for option, words in (("-tr", ("-tr", 40, 40)), ("--like", ("--like", coarse))):
+        result = run("rectify", pan, "--sharpen", colours, *words, *out)
+        assert f"{option}: the pixels of this image are" in result.output
+        assert "so there is no detail to add" in result.output
     assert not (tmp_path / "out").exists()

@@ -19,11 +19,11 @@ from ortho_pipeline.commands.rectification import rectify
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.sharpening.sharpen import require_one, require_several, sharpen
 from ortho_pipeline.display.numbers import significant
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.exchange.model_file import read_model_file
-from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.crs import ground_transform, map_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.correction import COEFFICIENTS
@@ -32,6 +32,7 @@ from ortho_pipeline.raster.pansharpened import colour_bands
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Progress
+from ortho_pipeline.surface.footprint import output_crs
 
 #: Options that open one image and cannot open both.
 _OF_ONE = ("rpc", "model", "crop_offset")
@@ -71,6 +72,7 @@ def rectify_bundle(
     require_one(colour_bands(RasterSource(pan, **scene.access)), pan)
     require_several(colour_bands(RasterSource(colours, **scene.access)), colours)
     opened = inputs.open_scene(colours, scene)
+    _require_detail(inputs.open_scene(pan, scene), opened, scene, output)
     common: dict[str, Any] = {"surface": surface, "progress": progress, "command": command, "overwrite": overwrite}
     sharp = rectify(pan, folder, scene=scene, points=points, match=match, output=output, **common)
     adjusted = read_model_file(sharp.files["model"]).model
@@ -127,7 +129,20 @@ def _refuse_options(
         )
 
 
-def _ratio_in(grid: Grid, model: SensorModel, scene: Scene) -> int:
+def _require_detail(pan: Scene, colours: Scene, scene: SceneOptions, output: OutputOptions) -> None:
+    """Refuse images that are no bundle, and pixels of an ortho that are too large, before the first ortho is made."""
+    model, resolution = taken_over(pan.model, colours), output.resolution
+    if output.like is not None:
+        with completed(os.fspath(output.like), field="output.like"):
+            grid = grid_of(output.like, **scene.access)
+        _ratio_in(grid, model, colours, "output.like")
+    elif resolution is not None:
+        crs = map_crs(output.crs) if output.crs else output_crs(pan.model, pan.width, pan.height)
+        dx, dy = (resolution, resolution) if isinstance(resolution, int | float) else resolution
+        _ratio_in(Grid(crs, 0.0, 0.0, dx, dy, 1, 1), model, colours)
+
+
+def _ratio_in(grid: Grid, model: SensorModel, scene: Scene, option: str = "output.resolution") -> int:
     """Return how many pixels of an ortho a pixel in the middle of an image is wide.
 
     Raises
@@ -143,8 +158,8 @@ def _ratio_in(grid: Grid, model: SensorModel, scene: Scene) -> int:
             f"the pixels of this image are {significant(float(ratio))} times as wide as those of the ortho, so there "
             "is no detail to add",
             file=scene.path,
-            field="output.resolution",
-            remedy=Text("leave out ", Setting("output.resolution"), ", or make the ortho of this image alone"),
+            field=option,
+            remedy=Text("leave out ", Setting(option), ", or make the ortho of this image alone"),
         )
     return round(float(ratio))
 
