@@ -365,7 +365,8 @@ def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     points = fit.points
     notices = [notice.in_image(label) for label, start in starts.items() for notice in start.scene.notices]
     notices += fit.warnings
-    for rejected in fit.rejected[:50]:
+    ties = {points.ids[k] for k in np.flatnonzero(points.tie)}
+    for rejected in sorted(fit.rejected, key=lambda one: one.point in ties)[:50]:
         where = f" in {rejected.image}" if rejected.image else (" (its ground)" if rejected.what == "ground" else "")
         text = f"point {rejected.point}{where} was rejected: {rejected.reason}"
         notices.append(Notice("left-out", text, point=rejected.point, reason=rejected.reason))

@@ -34,7 +34,7 @@ from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
 from ortho_pipeline.report.network.drawing import plot_network
 from ortho_pipeline.report.network.facts import displaced_checks, found_network, placed, suffices_for, thinly_covered
-from ortho_pipeline.report.page.advice import WORDS, Signal, signal_lines, signals
+from ortho_pipeline.report.page.advice import WORDS, Signal, shortened, signal_lines, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
 from ortho_pipeline.report.records import UNKNOWN, RpcRecord
@@ -408,7 +408,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         plan=None if plan is None else plan.svg(),
         plot_style=style_sheet(),
         provenance=report.provenance.to_json(),
-        signals=said,
+        signals=shortened(said, "left-out"),  # a table below has all of them
         levels=WORDS,
         script=script(),
         policy=policy(script()),

@@ -5,12 +5,15 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import jinja2
+import numpy as np
 from click.testing import CliRunner
 
+from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.block import _warnings
 from ortho_pipeline.display.drawing import Drawing
 from ortho_pipeline.report.network.drawing import _draw_pairs
-from ortho_pipeline.report.page.advice import signal_lines, signals
+from ortho_pipeline.report.page.advice import shortened, signal_lines, signals
 
 
 def test_the_code_follows_the_text():
@@ -35,6 +38,31 @@ def test_many_notices_of_one_kind_are_few_lines():
 def test_four_notices_of_one_kind_are_all_shown():
     lines = signal_lines(signals([], [{"code": "left-out", "text": f"G{n}"} for n in range(4)]))
     assert [line for line in lines if line.startswith("Warning")] == [f"Warning: G{n} [left-out]" for n in range(4)]
+
+
+def test_the_page_of_a_block_counts_gross_errors_which_its_table_lists():
+    """Dozens of rejected ties filled the list of notices."""
+    found = signals([], [{"code": code, "text": f"{n}"} for n in range(9) for code in ("left-out", "no-rpc")])
+    short = shortened(found, "left-out")
+    assert [one.text for one in short if one.code == "left-out"] == ["0", "1", "2", "6 more of this kind"]
+    assert [one.text for one in short if one.code == "no-rpc"] == [f"{n}" for n in range(9)]
+
+
+def test_rejected_control_is_named_before_rejected_ties():
+    """In the order of the file, control points came after ties, and were not shown."""
+    points = SimpleNamespace(
+        ids=("t1", "t2", "c1"),
+        tie=np.array([True, True, False]),
+        image=np.zeros(0, int),
+        measured=np.zeros((0, 2)),
+        control=np.array([False]),
+    )
+    rejected = [GrossError(point=name, what="point", image=None, reason="gross error") for name in points.ids]
+    fit = SimpleNamespace(points=points, warnings=(), rejected=rejected, parameters=(), object_rms=lambda: None)
+    points.images = ()
+    start = SimpleNamespace(scene=SimpleNamespace(notices=(), width=9, height=9))
+    named = [one.fields["point"] for one in _warnings(fit, {"a": start}) if one.code == "left-out"]
+    assert named == ["c1", "t1", "t2"]
 
 
 def test_a_page_says_once_what_to_do_about_notices_of_one_kind():

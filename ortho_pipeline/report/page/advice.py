@@ -203,7 +203,7 @@ def signal_lines(found: Sequence[Signal]) -> list[Text]:
     Of more than a few of one code, the others are counted. What several have to do stands once, below the last.
     """
     lines: list[Text] = []
-    shown = _counted(found)
+    shown = shortened(found)
     for number, one in enumerate(shown):
         lines.append(Text(f"{WORDS[one.level]}: ", one.text, f" [{one.code}]"))
         if one.to_do not in [other.to_do for other in shown[number + 1 : number + 2]]:
@@ -211,15 +211,19 @@ def signal_lines(found: Sequence[Signal]) -> list[Text]:
     return lines
 
 
-def _counted(found: Sequence[Signal]) -> list[Signal]:
-    """Return the first signals of each code, and one that counts the others. Texts without a code of their own stay."""
+def shortened(found: Sequence[Signal], *codes: str) -> list[Signal]:
+    """Return the first signals of each code (or of these codes), and one that counts the others.
+
+    Texts without a code of their own stay.
+    """
     kinds: dict[str, list[Signal]] = {}
     for one in found:
         kinds.setdefault(one.text if one.code == FROM_SENSOR else one.code, []).append(one)
     shown: list[Signal] = []
     for alike in kinds.values():
-        shown += alike if len(alike) <= _SHOWN + 1 else alike[:_SHOWN]
-        if (more := len(alike) - _SHOWN) > 1:
+        more = 0 if codes and alike[0].code not in codes else len(alike) - _SHOWN
+        shown += alike[:_SHOWN] if more > 1 else alike
+        if more > 1:
             shown.append(replace(alike[-1], text=f"{more} more of this kind"))
     return shown
 
