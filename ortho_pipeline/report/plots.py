@@ -22,6 +22,8 @@ from ortho_pipeline.report.records import SceneReport
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
 _PLOT_WIDTH, _PLOT_HEIGHT, _PAD = 452.0, 460.0, 19.0
+#: Least space between the head of an arrow and the edge of the drawing, CSS pixels.
+_EDGE = 5.0
 #: The longest arrow, as a share of the drawing area.
 _LONGEST = 0.13
 #: With more points than this, their ids would hide the arrows.
@@ -89,8 +91,14 @@ def plot_residuals(report: SceneReport) -> Drawing | None:
     lengths = [math.hypot(*point.residual) for point in points if point.kind != "out"]
     longest = max(lengths, default=0.0)
     arrow = _LONGEST * min(_PLOT_WIDTH, max(tall - 2 * _PAD, wide / 2)) / longest if longest > 0 else 0.0
+    # Room for arrows that leave the frame.
+    ends = image * scale + shift + arrow * np.array([p.residual if p.kind != "out" else (0.0, 0.0) for p in points])
+    before = np.maximum(_EDGE - ends.min(axis=0), 0.0)
+    after = np.maximum(ends.max(axis=0) + _EDGE - (wide, tall), 0.0)
+    wide, tall = (before + after + (wide, tall)).tolist()
+    shift += before
     label = f"Residual vectors of {counted(len(points), 'point')} over the frame of the image"
-    drawing = Drawing(wide, float(tall) + 36, label, "residuals")
+    drawing = Drawing(wide, tall + 36, label, "residuals")
     x0, y0 = shift
     if report.control_hull and report.control_hull.outline:
         corners = [tuple(np.array(corner) * scale + shift) for corner in report.control_hull.outline]
@@ -104,12 +112,12 @@ def plot_residuals(report: SceneReport) -> Drawing | None:
         if point.point.id in wrong:
             drawing.circle("doubted", float(at[0]), float(at[1]), 9.0)
         _draw_point(drawing, point, at, arrow, len(points) <= _MAX_LABELS)
-    _legend(drawing, points, float(tall) + 20)
+    _legend(drawing, points, tall + 20)
     if longest > 0:
         size = round_down(longest)
         bar = size * arrow
-        drawing.arrow("bar", wide - _PAD - bar, float(tall) + 20, bar, 0.0)
-        drawing.text(wide - _PAD - 8 - bar, float(tall) + 24, f"{size:g} px", anchor="end")
+        drawing.arrow("bar", wide - _PAD - bar, tall + 20, bar, 0.0)
+        drawing.text(wide - _PAD - 8 - bar, tall + 24, f"{size:g} px", anchor="end")
     return drawing
 
 

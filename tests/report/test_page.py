@@ -364,6 +364,21 @@ def test_the_north_arrow_covers_no_point_and_names_stay_on_the_map(index):
                 assert 10.0 < item["y"] < drawing.height
 
 
+@pytest.mark.parametrize("corner", [(0.0, 0.0), (1.0, 1.0)])
+def test_arrows_at_the_edge_of_the_image_are_not_cut_off(corner):
+    said = made(measured())
+    first, *others = said.adjustment.points
+    out = first.replaced(image=tuple(np.multiply(corner, said.scene.size).tolist()), residual=tuple(
+        (40.0 * np.subtract(corner, 0.5)).tolist()))  # fmt: skip
+    said = said.replaced(adjustment=said.adjustment.replaced(points=(out, *others)))
+    drawing = plot_residuals(said)
+    heads = [one["lines"] for what, one in drawing.items if what == "path" and one["kind"].endswith("-head")]
+    places = np.array([place for lines in heads for line in lines for place in line])
+    assert heads
+    assert (places > 0).all()
+    assert (places < (drawing.width, drawing.height)).all()
+
+
 def test_long_names_are_not_cut_off_and_points_off_the_map_have_none():
     said = made(measured())
     left, bottom, right, top = said.ortho.extent

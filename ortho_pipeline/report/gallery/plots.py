@@ -16,7 +16,7 @@ from ortho_pipeline.report.gallery.matches import MatchPoint, in_words, shown
 from ortho_pipeline.report.records import SceneReport
 
 #: Drawing area of the map, the space around it, and the narrowest drawing, CSS px.
-_SIDE, _PAD, _LEAST = 460.0, 14.0, 420.0
+_SIDE, _PAD, _LEAST = 440.0, 24.0, 420.0
 #: The longest vector as a share of the map's longer side, and the opacity of the field with the most matches.
 _LONGEST, _DARKEST = 0.05, 0.3
 #: Marks of rejected matches: polylines about their place, CSS px, by reason.
