@@ -32,6 +32,7 @@ from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 from ortho_pipeline.geodesy.distortion import map_from_enu, metres_of_steps
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
+from ortho_pipeline.models import SensorModel
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.delivered import accuracy_before
@@ -137,7 +138,7 @@ def build_report(
     adjustment, rmse_m = _adjustment(fit, noted), rmse_metres(fit)
     untested = refuted(noted["notices"]) or points_again(adjustment, scene.adjusted)
     return SceneReport(
-        scene=_scene(scene, seen),
+        scene=_scene(scene, seen, fit.model),
         adjustment=adjustment,
         rmse_m=rmse_m,
         view_rmse=_view_rmse(fit),
@@ -171,8 +172,11 @@ def patterns(covariance: Covariances) -> list[Notice]:
     return [Notice("systematic-errors", text, roles=roles)]
 
 
-def _scene(scene: Scene, seen: Mapping[str, Any]) -> SceneRecord:
+def _scene(scene: Scene, seen: Mapping[str, Any], model: SensorModel) -> SceneRecord:
+    middle = model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), model.reference_height)
+    lon_lat = ground_transform(model.crs, "EPSG:4979")(middle)[0, :2]
     known = {
+        "middle_lon_lat": lon_lat.tolist() if np.isfinite(lon_lat).all() else None,
         "name": Path(scene.path).name,
         "size": (scene.width, scene.height),
         "sensor": scene.sensor,

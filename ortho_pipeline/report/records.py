@@ -80,7 +80,7 @@ class View(Record):
 
 
 class SceneRecord(Record):
-    """The scene; geometry is that of its middle, by the adjusted model."""
+    """The scene; geometry is that of its middle, by the adjusted model. `middle_lon_lat` is at its reference height."""
 
     name: str
     size: Size
@@ -91,6 +91,7 @@ class SceneRecord(Record):
     lean_m_per_m: float | None
     lean_azimuth_deg: float | None
     view: View | None = None
+    middle_lon_lat: Pair | None = None
 
 
 # -- accuracy --------------------------------------------------------------------------------------------------------

@@ -118,6 +118,15 @@ def test_degrees_are_written_as_far_as_they_are_not_zero():
     assert degrees(-12.0, "EW") == "12° W"
 
 
+def test_the_place_of_a_fit_is_the_middle_of_the_image():
+    """It was the middle of the points, which may be in one corner."""
+    said = made(measured())
+    in_corner = tuple(one for one in said.adjustment.points if max(one.image) < 600)
+    said = said.replaced(ortho=None, adjustment=said.adjustment.replaced(points=in_corner))
+    middle = CAMERA.image_to_ground(np.array([said.scene.size]) / 2, CAMERA.reference_height)
+    np.testing.assert_allclose(place_of(said), middle[0, :2], atol=2e-4)
+
+
 def test_locator_finds_land_where_there_is_land():
     drawing = plot_locator(place_of(made(measured())))
     (land,) = (given["lines"] for what, given in drawing.items if what == "path" and given["kind"] == "land")

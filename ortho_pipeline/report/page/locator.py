@@ -22,10 +22,15 @@ _WIDTH, _SOUTH, _NORTH = 300.0, -60.0, 84.0
 
 
 def place_of(report: SceneReport) -> Pair | None:
-    """Return longitude and latitude of the middle of the ortho, or else of the points; None where neither is known."""
+    """Return longitude and latitude of the middle of the ortho, or else of the image; None where neither is known.
+
+    For a model that does not reach the middle of the image, and for reports of version 0.7, it is that of the points.
+    """
     if report.ortho is not None:
         lon, lat = Paper(report.ortho).middle()[0]
         return (float(lon), float(lat)) if np.isfinite([lon, lat]).all() else None
+    if report.scene.middle_lon_lat is not None:
+        return report.scene.middle_lon_lat
     known = [point.lon_lat for point in report.adjustment.points if is_known(point.lon_lat)]
     if not known:
         return None
