@@ -53,7 +53,7 @@ _SHOWN = 60
     "--threads",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Threads per scene.  [default: cores per job]",
+    help="Threads per scene.  [default: all processors, divided among the workers]",
 )
 @click.option(
     "--memory", "-wm", type=Megabytes(), default="512", show_default=True, metavar="MB", help="Memory per scene."

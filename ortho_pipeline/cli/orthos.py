@@ -124,7 +124,9 @@ def verify(
     metavar="PX",
     help="Most that the displacement of a smooth field may change from one pixel to the next.",
 )
-@click.option("--resampling", "-r", type=click.Choice(RESAMPLING), default="cubic", show_default=True)
+@click.option(
+    "--resampling", "-r", type=click.Choice(RESAMPLING), default="cubic", show_default=True, help="Resampling method."
+)
 @folder_option
 @open_option
 @click_options("output", OutputOptions, "nodata", "format", "creation_options", "memory", "threads")

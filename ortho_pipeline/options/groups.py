@@ -180,10 +180,11 @@ class PointOptions:
         float | None,
         Option(
             "--near",
-            "Analysis of residuals: points closer than this are neighbours.",
+            "State the relative error of points closer than this.",
             "M",
             kind="number",
             above=0,
+            unset="a distance with as many pairs as points",
         ),
     ] = None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
+import re
 
 import click
 import pytest
@@ -127,6 +128,15 @@ def test_every_flag_of_a_command_has_a_name() -> None:
     assert "surface.dem" not in flags_of(command_of("run"))
     assert flags_of(command_of("adjust"))["points.model"] == "--model"
     assert "scene.model" not in flags_of(command_of("adjust"))
+
+
+def test_every_option_says_what_it_does() -> None:
+    """`-r` of align and stack showed its choices only."""
+    for name in cli.list_commands(click.Context(cli)):
+        for one in command_of(name).params:
+            if isinstance(one, click.Option):
+                text = (one.help or "").partition("[default")[0]
+                assert re.match(r"[A-Z'].{8,}\.", text, re.DOTALL), (name, one.opts)
 
 
 @pytest.mark.parametrize("words", [("--dem", "a.tif", "--dem", "b.tif"), ("--dem=a.tif", "--dem", "a.tif")])

@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 @stack_options
 @click_options("match", MatchOptions, "reference", "search", "points")
 @click_options("surface", SurfaceOptions, "dem", "vertical", "override_vertical", "fill", "height", "source")
-@click.option("--resampling", "-r", type=click.Choice(RESAMPLING), default="cubic", show_default=True)
+@click.option(
+    "--resampling", "-r", type=click.Choice(RESAMPLING), default="cubic", show_default=True, help="Resampling method."
+)
 @folder_option
 @open_option
 @click_options("output", OutputOptions, "stac", "nodata", "creation_options", "memory", "threads")
