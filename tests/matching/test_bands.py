@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from trials import fitted
 from ortho_pipeline.commands.control.matching import _bands_apart
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.imaging import matching
+from ortho_pipeline.imaging.band_shifts import BandShift
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
@@ -65,13 +67,20 @@ def test_a_band_that_is_displaced_is_named_and_counts_in_the_sigmas(case: Case, 
     assert np.hypot(*(shifts[3] - shifts[1])) < 0.05
     assert max(max(one["sigma_px"]) for one in notice.fields["bands"]) < 0.05
     assert notice.fields["agreeing"] == [1, 3]
-    assert "`match.reference_bands=1,3`" in notice
+    assert notice.endswith("The largest group that agrees: `match.reference_bands=1,3`")
     # Variance of 0, 1, 0 px along the columns of the map, and none along its rows.
     spread = np.sqrt(1 / 3 / 2)
     assert notice.fields["spread_px"] == pytest.approx(spread, abs=0.02)
     assert fitted(case.model, found.points, "shift", case.frame).sigmas == pytest.approx([spread] * 2, abs=0.03)
     alone = replace(found.points, sigma_alike=None)
     assert (fitted(case.model, alone, "shift", case.frame).sigmas < 0.1).all()
+
+
+def test_no_band_is_proposed_if_all_disagree() -> None:
+    """The notice asked to choose bands that agree, and named one band."""
+    bands = tuple(BandShift(k, (float(k), 0.0), (0.01, 0.01)) for k in (1, 2, 3))
+    (notice,) = _bands_apart(SimpleNamespace(bands=bands))
+    assert notice.endswith("No two bands agree")
 
 
 def test_bands_that_agree_are_no_notice(case: Case, tmp_path: Path) -> None:

@@ -333,11 +333,15 @@ def _bands_apart(matches: Matches) -> list[Notice]:
         f"band {band.band} by {band.shift[0]:+.2f} ± {band.sigma[0]:.2f}, {band.shift[1]:+.2f} ± {band.sigma[1]:.2f}"
         for band in bands
     )
+    largest = (
+        ("The largest group that agrees: ", Setting("match.reference_bands", ",".join(map(str, agree))))
+        if len(agree) > 1
+        else ("No two bands agree",)
+    )
     text = Text(
         "bands of the reference give different positions of the scene, so the result is uncertain by ",
         f"{spread(bands):.1f} px. Shifts of single bands from the result (column, row, px): {shifts}. ",
-        "Choose bands that agree and look like the scene: ",
-        Setting("match.reference_bands", ",".join(map(str, agree))),
+        *largest,
     )
     fields = [{"band": band.band, "shift_px": list(band.shift), "sigma_px": list(band.sigma)} for band in bands]
     return [Notice("bands-disagree", text, bands=fields, agreeing=list(agree), spread_px=spread(bands))]

@@ -48,7 +48,7 @@ _LOOK: dict[str, str] = {
     "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the ortho "
     "there.",
     "bands-disagree": Text(
-        "Choose bands that agree and look like the scene (",
+        "From bands that agree, choose those that look like the scene (",
         Setting("match.reference_bands"),
         "): visible bands for a panchromatic scene.",
     ),
