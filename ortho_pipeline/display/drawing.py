@@ -80,6 +80,8 @@ LOOKS = {
 }
 #: Width of a letter on average in a wide font, CSS px.
 _LETTER = 7.4
+#: Height of a line of names, CSS px.
+_LINE = 12.0
 _FONT = 'system-ui,-apple-system,"Segoe UI",Roboto,sans-serif'
 
 
@@ -92,6 +94,8 @@ class Drawing:
     label: str
     name: str
     items: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    #: Where names are: the first x, the baseline and the last x.
+    names: list[tuple[float, float, float]] = field(default_factory=list)
 
     def line(self, kind: str, x1: float, y1: float, x2: float, y2: float) -> None:
         """Draw a line."""
@@ -116,13 +120,21 @@ class Drawing:
         self.items.append(("text", {"x": x, "y": y, "text": text, "anchor": anchor, "quiet": quiet, "turn": turn}))
 
     def caption(self, x: float, y: float, text: str, gap: float, *, left: bool, quiet: bool = False) -> None:
-        """Write a name to the left or right of `x`, on the other side where only that has room for it."""
+        """Write a name to the left or right of `x`, on the other side where only that has room for it.
+
+        A name that would cover another one on both sides is left out: neither could be read.
+        """
         size = gap + _LETTER * len(text)
         fits_left, fits_right = x >= size, x + size <= self.width
-        if (left and fits_left) or (not fits_right and (fits_left or x > self.width / 2)):
-            self.text(x - gap, y, text, anchor="end", quiet=quiet)
-        else:
-            self.text(x + gap, y, text, quiet=quiet)
+        left = (left and fits_left) or (not fits_right and (fits_left or x > self.width / 2))
+        for side in (left, not left):
+            start = x - size if side else x + gap
+            box = (start, y, start + _LETTER * len(text))
+            fits = side == left or (fits_left if side else fits_right)
+            if fits and not any(abs(y - v) < _LINE and start < end and begin < box[2] for begin, v, end in self.names):
+                self.names.append(box)
+                self.text(x - gap if side else x + gap, y, text, anchor="end" if side else "start", quiet=quiet)
+                return
 
     @contextmanager
     def titled(self, title: str, *, key: int | None = None) -> Iterator[None]:

@@ -373,6 +373,18 @@ def test_the_north_arrow_covers_no_point_and_names_stay_on_the_map(index):
                 assert 10.0 < item["y"] < drawing.height
 
 
+def test_names_do_not_cover_each_other():
+    """The second of two near points has its name on the other side, the third has none."""
+    drawing = Drawing(400.0, 100.0, "", "")
+    for k in range(3):
+        drawing.caption(200.0 + k, 50.0 + k, f"point {k}", 9, left=False)
+    drawing.caption(200.0, 75.0, "below", 9, left=False)
+    drawing.caption(395.0, 52.0, "edge", 9, left=False)
+    assert [(one["text"], one["anchor"]) for _, one in drawing.items] == [
+        ("point 0", "start"), ("point 1", "end"), ("below", "start"), ("edge", "end")
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("corner", [(0.0, 0.0), (1.0, 1.0)])
 def test_arrows_at_the_edge_of_the_image_are_not_cut_off(corner):
     said = made(measured())
