@@ -356,7 +356,7 @@ def test_page_without_optional_parts(tmp_path):
     report.write_report_html(made, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "Accuracy unknown" in page
-    assert "data-plot" not in page
+    assert re.findall(r"data-plot=\"(\w+)", page) == ["locator"]
     assert "<img" not in page
 
 
