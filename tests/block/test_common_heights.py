@@ -32,6 +32,12 @@ def settled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Solved, Selection
     return attempt(heights.applied(problem), state, selection), selection, heights
 
 
+def test_a_filled_height_is_no_observation(tmp_path: Path) -> None:
+    surface = dem(fly(Chain(images=3, convergence_deg=10.0, ties=50, errors=1.0), 2), tmp_path / "dem.tif", 2)
+    for fill in ("mask", "nearest", 12.0):
+        assert np.isnan(DemHeights(surface.with_fill(fill)).surface.heights([[0.0, 0.0]])).all()
+
+
 def test_they_are_unknowns_of_the_block(settled: tuple[Solved, Selection, Heights]) -> None:
     solved, _, heights = settled
     linear, planes = solved.linear, solved.problem.heights

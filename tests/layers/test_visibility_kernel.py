@@ -217,6 +217,18 @@ def test_lines_are_hidden_where_dense_sampling_finds_terrain_above_them(across, 
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.parametrize(("across", "down"), [(-1.0, 1e-300), (1.0, 1e-300), (1e-300, -1.0), (1e-300, 1.0)])
+def test_terrain_in_the_outermost_cells_hides(across, down):
+    heights = np.zeros((9, 9))
+    heights[[0, -1]] = heights[:, [0, -1]] = 40.0
+    way = np.array([across, down])
+    steep = steep_of(heights, way, way)[:2]
+    everything = np.full(steep[0].shape, heights.max()), np.full(steep[0].shape, -INF)
+    # The line has risen by 4 m at the edge; from 38 m it is above all.
+    for h, expected in ((1.0, True), (38.0, False)):
+        assert kernel._is_hidden(heights, *steep, *everything, 4.0, 4.0, h, across, down, 0.0) == expected
+
+
 def test_a_line_ends_where_the_bounds_tell_what_it_meets():
     heights = np.zeros((4, 12))
     tops, squares = np.full((3, 11), 9.0), np.full((1, 2), 9.0)

@@ -244,6 +244,18 @@ class Half(SensorModel):
         raise NotImplementedError
 
 
+def test_only_ground_within_the_domain_counts() -> None:
+    class Beyond(Half):
+        def ground_to_image(self, ground: Any) -> np.ndarray:
+            return np.where(np.abs(np.array(ground)[:, 2:]) > 500.0, 7.0, np.full((1, 2), np.nan))
+
+    require_view(Beyond(0.0, half=501.0))
+    with pytest.raises(InputError):
+        require_view(Beyond(0.0, half=499.0))
+    with pytest.raises(InputError):
+        require_view(Beyond(0.0, half=0.001))
+
+
 def test_a_model_needs_a_finite_domain_and_some_ground_in_its_image() -> None:
     require_view(Half(np.nan))
     for model in (Half(np.nan, seen=False), Half(np.inf), Half(0.0, half=np.inf), Half(0.0, half=np.nan)):

@@ -114,7 +114,7 @@ class Extent(NamedTuple):
     def widened(self, metres: float = _DRIFT) -> Extent:
         """Return the extent with the samples around it that interpolation wants, and ground that control may reach."""
         up = _MARGIN / ROWS + metres / _METRES_PER_DEGREE
-        far = min(90.0, max(abs(self.north), abs(self.south)) + up)
+        far = min(90.0, max(self.north, -self.south) + up)
         columns = columns_at(min(89, math.floor(far)))
         if far > 89.9:
             return Extent(-180.0, max(-90.0, self.south - up), 180.0, min(90.0, self.north + up))
