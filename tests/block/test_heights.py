@@ -109,6 +109,16 @@ def test_the_sigma_is_found_where_nobody_states_it(tmp_path: Path) -> None:
     assert any(notice.code == "dem-sigma-by-default" for notice in fit.warnings)
 
 
+def test_residuals_do_not_tell_the_sigma_of_correlated_errors(tmp_path: Path) -> None:
+    """The shared errors contain them: what is left, 0.01 m, is no accuracy of the DEM."""
+    block = fly(Chain(images=3, convergence_deg=10.0, ties=90), 3)
+    surface = dem(block, tmp_path / "dem.tif", 3, correlated=5.0, length=300.0)
+    fit = adjust(block.start, block.points, heights=DemHeights(surface, correlation=300.0))
+    assert fit.heights is not None
+    assert (fit.heights.sigma_is, fit.heights.sigma_m) == ("assumed", 10.0)
+    assert any(notice.code == "dem-sigma-by-default" for notice in fit.warnings)
+
+
 def test_no_heights_in_voids(tmp_path: Path) -> None:
     block = fly(Chain(images=4), 0)
     heights = dem(block, tmp_path / "dem.tif", 0, white=2.0, void=100.0).with_sigma(2.0)

@@ -250,7 +250,8 @@ def few(**more: Any) -> Heights:
     of = np.arange(6) < 5
     wrong = np.array([False, False, True, True, False, False])
     numbers = {"sigma": 2.0, "own": np.ones(6), "common": none, "wrong": wrong, "broken": ~of, **more}
-    return Heights(none, of, none, none, numbers.pop("stated", np.full(6, 2.0)), **numbers)
+    source: Any = SimpleNamespace(correlation=None)
+    return Heights(source, of, none, none, numbers.pop("stated", np.full(6, 2.0)), **numbers)
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
@@ -294,8 +295,9 @@ def test_the_sigma_of_spots_and_heights_together_is_estimated() -> None:
     of_spots = np.abs(random.normal(0, 0.4, 10))
     spots: Any = SimpleNamespace(standardised=lambda common, sigma: of_spots)
     nothing: Any = None
+    source: Any = SimpleNamespace(correlation=None)
     made = Heights(
-        nothing, np.ones(40, dtype=bool), nothing, nothing, None, 5.0, np.ones(40), nothing, nothing, nothing,
+        source, np.ones(40, dtype=bool), nothing, nothing, None, 5.0, np.ones(40), nothing, nothing, nothing,
         spots=spots,
     )  # fmt: skip
     found = made._estimated(residuals, 25.0 * redundancy, np.ones(40, dtype=bool))

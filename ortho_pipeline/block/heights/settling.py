@@ -260,6 +260,9 @@ class Heights:
 
     def _estimated(self, residuals: Array, variances: Array, used: Mask) -> Heights:
         """Return them with a robust sigma of the residuals; unchanged if too few have enough redundancy."""
+        # Correlated errors are in the shared ones, so the residuals do not show them.
+        if self.source.correlation is not None:
+            return self
         redundancy = variances / self.sigma**2
         testable = used & (redundancy > _REDUNDANT)
         scaled = np.abs(residuals[testable]) / np.sqrt(redundancy[testable])
