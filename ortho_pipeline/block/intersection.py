@@ -1,10 +1,11 @@
 r"""Forward intersection: the ground point that the rays of several images meet in best.
 
 For each point alone the sum of squares of :math:`(l_i - f_i(X)) / \sigma_i` over its rays is minimised, all points side
-by side. The covariance of a point is :math:`\sigma_0^2 (B^T B)^{-1}` with the weighted partials :math:`B` of its rays;
-errors of the models themselves are not in it (they are in that of an adjustment). With a redundancy below 4, rays can
-meet by chance: stated sigmas hold. Points whose rays miss each other by far more than those of all others do not count
-for :math:`\sigma_0`: one gross error would scale the sigmas of all points.
+by side. The covariance of a point is :math:`\sigma_0^2 (B^T B)^{-1}` with the weighted partials :math:`B` of its rays,
+times :math:`r / (r - 2)` with the redundancy :math:`r` of all points (Student's distribution: few residuals leave
+:math:`\sigma_0` uncertain). Errors of the models themselves are not in it (they are in that of an adjustment). With a
+redundancy below 4, rays can meet by chance: stated sigmas hold. Points whose rays miss each other by far more than
+those of all others do not count for :math:`\sigma_0`: one gross error would scale the sigmas of all points.
 """
 
 from __future__ import annotations
@@ -100,7 +101,8 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     models : mapping of image name to SensorModel
         One for each image of the points.
     scaled : bool
-        Scale covariances by the estimated sigma0² of all points together, if their redundancy is at least 4.
+        Scale covariances by the estimated sigma0² of all points together and by its uncertainty, if their redundancy is
+        at least 4.
 
     Raises
     ------
@@ -144,7 +146,8 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     rows = np.zeros((points.rays, 2, 3))
     rows[rays] = partials
     if scaled and sigma0 is not None and freedom >= LEAST_REDUNDANCY:
-        covariance *= np.where(contradicting, squares / np.maximum(freedoms, 1), sigma0**2)[:, None, None]
+        unit = sigma0**2 * freedom / (freedom - 2)
+        covariance *= np.where(contradicting, squares / np.maximum(freedoms, 1), unit)[:, None, None]
     # Along a ray the image does not change: it is across both rows of the partials.
     directions = np.where(found[points.point, None], np.cross(rows[:, 0], rows[:, 1]), np.nan)
     one, _, angles = ray_angles(points.point, directions)

@@ -105,7 +105,8 @@ def test_points_are_those_of_least_squares(scaled: bool) -> None:
         covariances.append(np.linalg.inv(rows.T @ rows))
     # Nine rays are 18 equations for 9 unknowns.
     assert found.sigma0 == pytest.approx(np.sqrt(squares / 9), rel=1e-4)
-    scale = squares / 9 if scaled else 1.0
+    # Sigma0 is estimated itself: the variance of Student's distribution is 9 / 7.
+    scale = squares / 7 if scaled else 1.0
     # On the central meridian, east is x; a metre of the map is 1 / 0.9996 of the ground.
     np.testing.assert_allclose(found.covariance, scale * np.array(covariances), rtol=2e-3, atol=1e-4)
     np.testing.assert_allclose(found.sigmas, np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))
@@ -208,7 +209,7 @@ def test_points_of_one_two_and_three_rays_weigh_by_covariances() -> None:
         covariances.append(cofactors)
     # Five rays are ten equations for six unknowns.
     assert found.sigma0 == pytest.approx(np.sqrt(squares / 4), rel=1e-4)
-    np.testing.assert_allclose(found.covariance[:2], squares / 4 * np.array(covariances), rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(found.covariance[:2], squares / 2 * np.array(covariances), rtol=2e-3, atol=2e-3)
     assert np.isnan(found.covariance[2]).all()
     assert np.isnan(found.residuals[points.point == 2]).all()
     assert np.isnan(found.angles_deg).tolist() == [False, False, True]
