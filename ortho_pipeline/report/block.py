@@ -273,11 +273,11 @@ def height_lines(heights: HeightsRecord | None) -> list[str]:
     if heights is None:
         return []
     left = f", {len(heights.left_out)} left out" if heights.left_out else ""
-    return [
-        f"{counted(heights.used, 'height')} of the DEM{left}: "
-        f"sigma {significant(heights.sigma_m)} m ({heights.sigma_is}), "
-        f"bias {heights.bias_m:+.2f} m (sigma {significant(heights.bias_sigma_m)} m)"
-    ]
+    if heights.at_breaks > heights.used:
+        left += f", {heights.at_breaks} where it differs from a plane by more than its sigma allows"
+    sigma = f"sigma {significant(heights.sigma_m)} m ({heights.sigma_is})"
+    bias = f"bias {heights.bias_m:+.2f} m (sigma {significant(heights.bias_sigma_m)} m)"
+    return [f"{counted(heights.used, 'height')} of the DEM{left}: {sigma}, {bias}"]
 
 
 def camera_lines(parameters: Sequence[SharedParameterRecord]) -> list[str]:

@@ -12,6 +12,7 @@ import pytest
 from ortho_pipeline.block.heights.adjusted_dem import AdjustedDem
 from ortho_pipeline.block.heights.common_heights import CommonHeights
 from ortho_pipeline.block.heights.record import record_of
+from ortho_pipeline.report.block import height_lines
 
 COUNT = 12
 
@@ -65,8 +66,20 @@ def test_every_point_that_takes_part_is_counted_once_with_its_first_reason() -> 
 def test_without_a_height_nothing_is_said_of_residuals() -> None:
     heights, solved = made()
     found = record_of(heights, solved)
-    assert (found.used, found.rms_m, found.mean_error_m, found.sigma_m) == (0, None, 0.0, 9.0)
+    assert (found.used, found.rms_m, found.mean_error_m) == (0, None, 0.0)
     assert found.without == 6
+    # The stated sigmas of the heights that could have been used, not the 9 m that count where none is stated.
+    assert found.sigma_m == pytest.approx(np.sqrt((1.0 + 4.0 + 16.0 + 7 * 49.0) / 10))
+    heights.sigmas = np.full(COUNT, np.nan)
+    assert record_of(heights, solved).sigma_m == 9.0
+
+
+def test_a_line_says_why_most_heights_are_not_used() -> None:
+    """A sigma of 1 cm over terrain of 10 m cells: the DEM is a plane nowhere."""
+    found = record_of(*made())
+    few = found.model_copy(update={"used": 2, "at_breaks": 3})
+    assert "2 heights of the DEM, 1 left out, 3 where it differs from a plane" in height_lines(few)[0]
+    assert "plane" not in height_lines(few.model_copy(update={"at_breaks": 2}))[0]
 
 
 @pytest.mark.parametrize("applied", [False, True])

@@ -113,7 +113,7 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
     assert planes is not None
     used = rows[planes.on[rows]]
     apart = planes.above(solved.state.local)[used]
-    sigmas = heights.sigmas[used]
+    sigmas = heights.sigmas[used if len(used) else heights.of]
     known = sigmas[np.isfinite(sigmas)]
     bias, bias_sigma = heights.common.bias
     active = np.zeros(len(heights.of), dtype=bool)
