@@ -318,6 +318,8 @@ class _Run:
 
     def _mosaic(self, crew: Crew, jobs: Sequence[Job]) -> dict[str, Any] | None:
         """Make the mosaic of the finished scenes; its document has the error, if any. Remove one no longer wanted."""
+        with contextlib.suppress(OrthoError):
+            clear_up(self.planned.output / MOSAIC_RECORD)
         if self.planned.mosaic is None:
             _remove_mosaic(self.planned.output)
             return None

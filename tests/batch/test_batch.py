@@ -350,18 +350,20 @@ def test_a_file_of_the_current_folder_is_not_meant(block, tmp_path, monkeypatch)
     assert options == {"camera": str(block.folder / "camera.json"), "band": "2", "all": "true"}
 
 
-def test_what_a_killed_run_left_beside_a_record_goes_though_the_scene_is_unchanged(block):
+@pytest.mark.parametrize("record", ["one.json", "mosaic/record.json"])
+def test_what_a_killed_run_left_beside_a_record_goes_though_the_scene_is_unchanged(block, record):
     """Killed between the rename of the record and the removal of its lock, as a run was by `make faults`."""
     (block.folder / "raw").mkdir(exist_ok=True)
     for path in (block.folder / "raw").iterdir():
         path.unlink()
     block.scene("raw/one.tif")
+    block.write(f"mosaic: {{format: VRT}}\n{FILE}")
     assert block.run() == {"one": "done"}
     state = block.out / ".run"
-    left = Outputs(state, "one.json")
-    (state / f"{left.prefix}lock.part").touch()
+    left = Outputs((state / record).parent, Path(record).name)
+    left.lock_path.touch()
     assert block.run() == {"one": "unchanged"}
-    assert not list(state.glob(".*.part"))
+    assert not list(state.rglob(".*.part"))
 
 
 def test_outputs_are_no_scenes(block):
