@@ -153,6 +153,26 @@ def test_kernels_of_a_version_whose_types_are_gone_are_compiled_anew(tmp_path: P
     assert found == ["42 0\n", "42 1\n", "42 0\n"]
 
 
+def test_code_that_another_process_kept_for_other_types_is_not_taken(tmp_path: Path) -> None:
+    """Two processes that compile a kernel for two types at once may name one file for both; -1 was returned."""
+    (tmp_path / "one.py").write_text(ONE.replace("2 * x", "int(x[0])"))
+    code = f"""
+import numpy as np
+from pathlib import Path
+from one import double
+from ortho_pipeline.runtime.compiled import compiled
+again = lambda value, kind: compiled(double.py_func)(np.array([value], kind))  # as in another process
+print(again(-1, 'i2'))
+folder = Path({str(tmp_path / "cache")!r})
+(file,) = folder.glob('*/*.nbc')
+signed = file.read_bytes()
+print(again(65535, 'u2'))
+[file.write_bytes(signed) for file in folder.glob('*/*.nbc')]
+print(again(65535, 'u2'))
+"""
+    assert cached(tmp_path, code).split() == ["-1", "65535", "65535"]
+
+
 def test_every_kernel_keeps_its_own_code_whatever_its_module_is_called(tmp_path: Path) -> None:
     """Files lie next to each other, and kernels of two rooms have the same module and name."""
     for room, factor in (("near", 2), ("far", 3)):

@@ -92,7 +92,7 @@ class _Kept(NullCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load what is compiled, from where this user keeps it, else from where root does."""
-        loaded = (cache.load_overload(sig, target_context) for cache in (self.own, self.of_root) if cache)
+        loaded = (_loaded(cache, sig, target_context) for cache in (self.own, self.of_root) if cache)
         return next((found for found in loaded if found is not None), None)
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -101,6 +101,15 @@ class _Kept(NullCache):
             _say_once()
         else:
             self.own.save_overload(sig, data)
+
+
+def _loaded(cache: FunctionCache, sig: Any, target_context: Any) -> Any:
+    """Return what is compiled for types of arguments, or None.
+
+    Two processes that compile a kernel for different types at once may give both the same file.
+    """
+    found = cache.load_overload(sig, target_context)
+    return found if found is not None and tuple(found.signature.args) == tuple(sig) else None
 
 
 @functools.cache
