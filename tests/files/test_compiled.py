@@ -173,6 +173,31 @@ print(again(65535, 'u2'))
     assert cached(tmp_path, code).split() == ["-1", "65535", "65535"]
 
 
+def test_a_cache_that_is_damaged_or_whose_disk_is_full_stops_nothing(tmp_path: Path) -> None:
+    (tmp_path / "one.py").write_text(ONE)
+    code = f"""
+import resource
+from pathlib import Path
+from one import double
+from ortho_pipeline.runtime.compiled import compiled
+again = lambda value: compiled(double.py_func)(value)  # as in another process
+print(again(1))
+for ending in ('nbi', 'nbc'):
+    (file,) = Path({str(tmp_path / "cache")!r}).glob('*/*.' + ending)
+    whole = file.read_bytes()
+    for size in (0, len(whole) // 2):
+        file.write_bytes(whole[:size])
+        print(again(2), file.stat().st_size == len(whole))
+resource.setrlimit(resource.RLIMIT_FSIZE, (9, 9))
+print(again(2.5))
+print(again(2.5j))
+"""
+    told = cached(tmp_path, code)
+    assert told.count("4 True\n") == 4, told
+    assert "5.0\n5j\n" in told
+    assert told.count("cannot be written (File too large)") == 1
+
+
 def test_every_kernel_keeps_its_own_code_whatever_its_module_is_called(tmp_path: Path) -> None:
     """Files lie next to each other, and kernels of two rooms have the same module and name."""
     for room, factor in (("near", 2), ("far", 3)):

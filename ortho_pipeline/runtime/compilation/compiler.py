@@ -5,6 +5,7 @@ What root has compiled, as for an image of a container, is taken from there.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import logging
@@ -96,19 +97,28 @@ class _Kept(NullCache):
         return next((found for found in loaded if found is not None), None)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep what is compiled in this user's folder, or say that there is none."""
+        """Keep what is compiled in this user's folder, or say why that is impossible."""
         if self.own is None:
-            _say_once()
-        else:
+            _say_once(cache_folders.own()[1])
+            return
+        try:
             self.own.save_overload(sig, data)
+        except Exception as error:
+            _say_once(f"{self.own.cache_path} cannot be written ({getattr(error, 'strerror', None) or error})")
 
 
 def _loaded(cache: FunctionCache, sig: Any, target_context: Any) -> Any:
     """Return what is compiled for types of arguments, or None.
 
-    Two processes that compile a kernel for different types at once may give both the same file.
+    Two processes that compile a kernel for different types at once may give both the same file. A disk that was full,
+    or lost its power, leaves files that cannot be read: pickles, which raise whatever their bytes lead to.
     """
-    found = cache.load_overload(sig, target_context)
+    try:
+        found = cache.load_overload(sig, target_context)
+    except Exception:
+        with contextlib.suppress(OSError):
+            cache.flush()
+        return None
     return found if found is not None and tuple(found.signature.args) == tuple(sig) else None
 
 
@@ -127,10 +137,10 @@ def _sources(module: str) -> str:
 
 
 @functools.cache
-def _say_once() -> None:
+def _say_once(reason: str) -> None:
     log.warning(
         "Compiled kernels are not cached, because %s. Every run compiles them again, for some seconds. "
-        "Remedy: set %s to a folder of your own to which nobody else can write",
-        cache_folders.own()[1],
+        "Remedy: set %s to a folder of your own with free space, to which nobody else can write",
+        reason,
         cache_folders.FOLDER,
     )
