@@ -13,6 +13,8 @@ from osgeo import gdal
 from pairs import BENT, SHIFTED, Pair
 
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.orthos import aligning
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
 from ortho_pipeline.geodesy.crs import parse_crs
@@ -188,3 +190,18 @@ def test_the_ortho_is_no_reference_of_itself(shifted, tmp_path):
     folder = "-o", tmp_path / "out"
     assert run("align", shifted[0], "--reference", shifted[0], *folder).exit_code == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_the_ortho_appears_with_its_report_or_not_at_all(shifted, tmp_path, monkeypatch):
+    """A full disk after the ortho left the new one beside the report of the old one."""
+    first = aligned(*shifted, tmp_path, "--match-points", 60, "--no-resample", "--format", "GTiff")
+    assert first["ortho"] == str(tmp_path / "ortho_aligned.tif")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def fail(*given: Any) -> None:
+        raise InputError("cannot write here (No space left on device)")
+
+    monkeypatch.setattr(aligning, "write_page", fail)
+    done = run("align", shifted[0], "--reference", shifted[1], "-o", tmp_path, "--match-points", 60)
+    assert done.exit_code == 2
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

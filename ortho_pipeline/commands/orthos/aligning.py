@@ -20,13 +20,13 @@ from ortho_pipeline.commands.orthos.verifying import displacements, document_of,
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.scene_fit import by_matches
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
 from ortho_pipeline.estimation.statistics import chance_of_mean
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
-from ortho_pipeline.files import retire, together, write_json
+from ortho_pipeline.files import retire, staged, together, write_json
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.matching.matcher import held_out
 from ortho_pipeline.models import ImageCorrection, MapGrid, SensorModel, SmoothField
@@ -115,32 +115,32 @@ def align(
     request = Request(ortho, scene, match=match, output=output)
     check_paths(files, request)
     record = provenance_of(request, measured.scene, None, hidden, command)
-    # The ortho gets its name first: what is left is measured in it.
-    if resample:
-        write_resampled(measured.scene, chosen.model, _output_grid(measured), files["ortho"], output, scene, progress)
-    else:
-        dataset = open_dataset(ortho, **scene.access)
-        write_moved(dataset, moved_geotransform(_grid_of(measured).geotransform, chosen.shift), files["ortho"])
     # The masks show the ground where the ortho showed it before.
     column, row = chosen.shift.tolist()
     moved = [dataclasses.replace(mask, shift=(column, row)) for mask in hidden]
-    document = _after(files["ortho"], measured, match, scene, output, moved, band) | {"before": before}
-    document["correction"] = _described(chosen)
-    document["resampled"] = resample
-    document["provenance"] = record
     # Next to this ortho, one of an earlier run in the other format would be taken for it.
     other = files["ortho"].with_suffix(".tif" if as_vrt else ".vrt")
     is_input = other.resolve() in {Path(path).resolve() for _, path in request.files}
     with together(folder, stem):
+        if resample:
+            write_resampled(
+                measured.scene, chosen.model, _output_grid(measured), files["ortho"], output, scene, progress
+            )
+        else:
+            dataset = open_dataset(ortho, **scene.access)
+            write_moved(dataset, moved_geotransform(_grid_of(measured).geotransform, chosen.shift), files["ortho"])
+        document = _after(files["ortho"], measured, match, scene, output, moved, band) | {"before": before}
+        document["correction"] = _described(chosen)
+        document["resampled"] = resample
+        document["provenance"] = record
         if files["json"].is_file() and not is_input:
             retire([other])
         write_json(files["json"], document)
         write_json(files["displacements"], displacements(measured))
         size = measured.size
         write_model_file(SavedModel(chosen.model, measured.scene.sensor, str(ortho), size, {}), files["model"])
-        write_page(
-            document, files["html"], files["ortho"], scene.access | {"roots": (Path(ortho).parent, *scene.roots)}
-        )
+        access = scene.access | {"roots": (Path(ortho).parent, *scene.roots)}
+        write_page(document, files["html"], staged(files["ortho"]), access)
     return Result(files, document, summary_text(document))
 
 
@@ -267,12 +267,18 @@ def _after(
     masks: Sequence[ClassMask],
     band: int | None,
 ) -> dict[str, Any]:
-    """Return the document of the aligned ortho, measured in its own pixels."""
+    """Return the document of the aligned ortho, measured in its own pixels, before it has its name."""
     opened = dataclasses.replace(scene, roots=(Path(measured.scene.path).parent, *scene.roots))
     # What is left is small.
     again = dataclasses.replace(match, search=min(match.search or np.inf, 30.0 * measured.pixel), search_rotation=None)
-    found = measure_ortho(path, again, scene=opened, masks=masks, band=band or measured.band, output=output)
-    return document_of(found, match)
+    made = staged(path)
+    try:
+        found = measure_ortho(made, again, scene=opened, masks=masks, band=band or measured.band, output=output)
+    except OrthoError as error:
+        if error.file == str(made):
+            error.file = str(measured.scene.path)
+        raise
+    return document_of(found, match) | {"ortho": str(path)}
 
 
 def _described(chosen: Chosen) -> dict[str, Any]:
