@@ -10,6 +10,7 @@ import errno
 import functools
 import importlib
 import logging
+import os
 import shlex
 import sys
 from collections.abc import Container
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from ortho_pipeline.cli.machine.added import AddedCommands
 
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
+#: Errors of the system about a file that is there, and that a user may not or cannot use.
+_NO_ACCESS = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.EROFS, errno.EIO, errno.ENAMETOOLONG)
 #: Every command of the host, by what people want to do: its module in this room, and the first sentence of its help.
 GROUPS = {
     "Make orthos": {
@@ -160,7 +163,8 @@ class _Commands(click.Group):
             raise
         except (Exception, SystemExit) as error:
             # An exit by a library or a plugin would look like success.
-            return self._fail(ctx, _fault(error), FAILED)
+            fault = _fault(error)
+            return self._fail(ctx, fault, CORRECTABLE if isinstance(fault, InputError) else FAILED)
 
     def _fail(self, ctx: click.Context, error: OrthoError, code: int) -> None:
         """Print an error, with ``--debug`` after its traceback, and end with an exit code."""
@@ -195,7 +199,7 @@ def _print_usage_error(words: Container[str], error: click.UsageError) -> None:
 
 
 def _fault(error: BaseException) -> OrthoError:
-    """Return an unexpected error as one that users can report, or correct if a disk is full."""
+    """Return an unexpected error as one that users can report, or correct if it is one of a disk or of rights."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         full = OrthoError(
             f"cannot write ({error.strerror})",
@@ -204,6 +208,14 @@ def _fault(error: BaseException) -> OrthoError:
         )
         full.__cause__ = error
         return full
+    if isinstance(error, OSError) and error.errno in _NO_ACCESS and error.filename:
+        closed = InputError(
+            f"cannot access this file or folder ({error.strerror})",
+            file=os.fsdecode(error.filename),
+            remedy="check its path, its permissions and those of the folders above it",
+        )
+        closed.__cause__ = error
+        return closed
     fault = OrthoError(
         f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
         remedy="this is a bug in ortho-pipeline; run the command again with --debug and report the traceback",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Iterator
 
@@ -199,3 +200,19 @@ def test_an_empty_value_is_refused_and_not_taken_for_no_option(tiny, tmp_path, w
     done = CliRunner().invoke(cli, command)
     assert done.exit_code == 2
     assert f"The value of '{words[0].rstrip('=')}' is empty" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["stack", "align"])
+def test_paths_that_the_system_refuses_are_named_and_no_bug(command, monkeypatch, tmp_path):
+    """Folders above it that may not be entered, links that lead in a circle, names that are too long."""
+    place = tmp_path / ("x" * 300 + "*.tif" if command == "stack" else "moved.tif")
+    if command == "align":
+
+        def refuse(*given: object, **named: object) -> None:
+            raise PermissionError(errno.EACCES, "Permission denied", str(place))
+
+        monkeypatch.setattr("ortho_pipeline.commands.orthos.aligning.measure_ortho", refuse)
+    error = document([command, str(place), "--reference", str(place), "-o", str(tmp_path / "out")])
+    assert error["file"] == str(place)
+    assert error["message"].startswith("cannot access this file or folder (")
+    assert "permissions" in error["remedy"]
