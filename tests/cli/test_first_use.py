@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shlex
 import shutil
 from pathlib import Path
@@ -199,3 +201,20 @@ def test_a_pattern_in_quotes_is_called_one(tmp_path):
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     assert "there is no folder" in run("info", tmp_path / "none" / "scene.tif").stderr
+
+
+def test_a_closed_folder_and_a_link_in_a_circle_do_not_hide_the_rest(tmp_path, monkeypatch, caplog):
+    """Such as the folder ``lost+found`` at the root of a disk."""
+    (tmp_path / "lost+found").mkdir()
+    (tmp_path / "circle.tif").symlink_to("circle.tif")
+    (tmp_path / "points.csv").write_text((SAMPLE / "gcps.csv").read_text())
+    scandir = os.scandir
+
+    def closed(folder: Any) -> Any:
+        if Path(folder).name == "lost+found":
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", closed)
+    assert [file.path for file in survey(tmp_path).found] == ["points.csv"]
+    assert "lost+found: cannot read this folder (Permission denied); it is left out" in caplog.text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from ortho_pipeline.points import read_points
 from ortho_pipeline.points.formats import SUFFIXES
 from ortho_pipeline.raster.source import open_dataset
 
+_log = logging.getLogger(__name__)
 Kind = Literal["scene", "dem", "map image", "image", "points"]
 
 #: Endings of files that are tried as images and as points.
@@ -172,11 +174,20 @@ def _left_out(names: list[str], reasons: list[str]) -> list[Notice]:
 
 
 def _files(folder: Path, depth: int) -> Iterator[Path]:
-    """Yield the files of a folder and of those in it, by name; hidden ones and linked folders are left out."""
-    with os.scandir(folder) as listed:
-        entries = sorted((entry for entry in listed if not entry.name.startswith(".")), key=lambda one: one.name)
+    """Yield the files of a folder and of those in it, by name; hidden ones and linked folders are left out.
+
+    So is what cannot be read, such as the folder ``lost+found`` of a disk, and links that lead nowhere.
+    """
+    try:
+        with os.scandir(folder) as listed:
+            entries = sorted((entry for entry in listed if not entry.name.startswith(".")), key=lambda one: one.name)
+    except OSError as error:
+        if depth == _DEPTH:
+            raise
+        _log.warning("%s: cannot read this folder (%s); it is left out", folder, error.strerror)
+        return
     for entry in entries:
-        if entry.is_file():
+        if os.path.isfile(entry.path):
             yield Path(entry.path)
         elif depth and entry.is_dir(follow_symlinks=False):
             yield from _files(Path(entry.path), depth - 1)
