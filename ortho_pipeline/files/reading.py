@@ -51,6 +51,7 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError) and not isinstance(path, VsiPath):
             told["remedy"] = check_path(path)
+        told.setdefault("remedy", "check its path and its permissions")
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"this file cannot be read ({reason})", file=path, **told) from error
 

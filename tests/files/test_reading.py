@@ -16,6 +16,9 @@ def test_one_byte_more_than_the_limit_is_read(tmp_path: Path) -> None:
     assert [read_bounded(tmp_path / "a", limit) for limit in (6, 5, 4, 3)] == [b"12345", b"12345", b"12345", b"1234"]
     with pytest.raises(InputError):
         read_bounded(tmp_path, 6)
+    with pytest.raises(InputError, match="cannot be read") as caught:
+        read_bounded(tmp_path / ("x" * 300), 6)
+    assert caught.value.remedy
 
 
 def test_a_json_file_may_be_as_large_as_its_limit(tmp_path: Path) -> None:
