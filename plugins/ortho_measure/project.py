@@ -341,7 +341,8 @@ class Project(_Shown):
     def save(self) -> None:
         """Write the GeoJSON, unless it already has all actions."""
         with self._lock:
-            if self.journal.read_only or self._saved == len(self.journal.actions):
+            is_saved = self._saved == len(self.journal.actions) and self.output.exists()
+            if self.journal.read_only or is_saved:
                 return
             document, count = self._document(), len(self.journal.actions)
             write_json(self.output, document)

@@ -190,6 +190,15 @@ def test_points_that_another_program_changed_are_not_overwritten(opens: Opens, t
     assert json.loads(path.read_text())["features"] == document["features"]
 
 
+def test_points_that_were_deleted_after_they_were_saved_are_saved_again(opens: Opens, tmp_path: Path) -> None:
+    session = opens(gcps=SAMPLE / "gcps.geojson")
+    session.save()
+    before = session.output.read_bytes()
+    session.output.unlink()
+    session.save()
+    assert session.output.read_bytes() == before
+
+
 def test_typed_ground_is_understood(opens: Opens, monkeypatch: pytest.MonkeyPatch) -> None:
     session = opens()
     lon, lat, height = 33.35, 37.25, 800.0
