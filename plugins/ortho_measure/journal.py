@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import Lock, allowed, open_itself, parse_json, sync_folder
 
 #: A larger file (bytes) is not a journal of manual measurements.
@@ -74,7 +75,7 @@ class Journal:
         Raises
         ------
         InputError
-            If another process holds the lock, or the journal cannot be written.
+            If another process holds the lock, or the journal cannot be written, or is no longer in its place.
         """
         if self._lock is None:
             raise InputError(
@@ -82,11 +83,27 @@ class Journal:
                 file=self.path,
                 remedy="close the other process, and start again",
             )
+        self._require_in_place()
         try:
             self._lock.append(_line(action))
         except OSError as error:
             raise _unwritable(self.path, error) from error
         self.actions.append(dict(action))
+
+    def _require_in_place(self) -> None:
+        """Refuse to write to a file that has no name any more, or another one: nobody would find it."""
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(self._file), os.stat(self.path, follow_symlinks=False)):
+                return
+        raise InputError(
+            "the journal was moved, deleted or replaced, so this action is not saved",
+            file=self.path,
+            remedy=Text(
+                "move it back; or save, close this process, and start again with the saved points as ",
+                Setting("points.gcps"),
+                " and another output",
+            ),
+        )
 
     def more(self) -> list[dict[str, Any]]:
         """Return and keep what another process has written since; an incomplete line is left for later.

@@ -57,6 +57,22 @@ def test_cut_off_at_any_byte_it_loses_the_last_action_at_most(written: Path) -> 
             again.close()
 
 
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_journal_that_was_moved_takes_no_action_until_it_is_back(written: Path, replaced: bool) -> None:
+    """What was written to it went with it, or was lost with a deleted one."""
+    journal, aside = Journal(written), written.with_name("aside")
+    written.rename(aside)
+    if replaced:
+        written.write_bytes(aside.read_bytes())
+    with pytest.raises(InputError, match="moved, deleted or replaced") as caught:
+        journal.append(put("lost"))
+    assert caught.value.file == str(written)
+    aside.replace(written)
+    journal.append(put("kept"))
+    journal.close()
+    assert [action["mark"]["id"] for action in Journal(written).actions][-2:] == ["P19", "kept"]
+
+
 def test_a_line_that_is_wrong_before_the_end_is_an_error_and_nothing_is_changed(written: Path) -> None:
     data = bytearray(written.read_bytes())
     data[len(data) // 2] ^= 1
