@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -205,3 +207,22 @@ def test_the_ortho_appears_with_its_report_or_not_at_all(shifted, tmp_path, monk
     done = run("align", shifted[0], "--reference", shifted[1], "-o", tmp_path, "--match-points", 60)
     assert done.exit_code == 2
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_an_input_that_changes_during_the_run_is_an_error(shifted, tmp_path, monkeypatch, which):
+    """The correction of the old pixels was applied to the new ones."""
+    paths = [shutil.copy(path, tmp_path) for path in shifted]
+    choose = aligning._choose
+
+    def changed(*given: Any) -> Any:
+        os.utime(paths[which], ns=(1, 1))
+        return choose(*given)
+
+    monkeypatch.setattr(aligning, "_choose", changed)
+    done = run(
+        "align", paths[0], "--reference", paths[1], "-o", tmp_path / "out", "--match-points", 60, "--no-resample"
+    )
+    assert done.exit_code == 2
+    assert f"{paths[which]}: this file changed during the run" in done.output
+    assert not (tmp_path / "out").exists()

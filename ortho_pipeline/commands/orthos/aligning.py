@@ -17,6 +17,7 @@ from ortho_pipeline.commands.orthos.measuring import BENDING, MeasuredOrtho, aff
 from ortho_pipeline.commands.orthos.resampling import write_resampled
 from ortho_pipeline.commands.orthos.statistics import Verified, tested_cells
 from ortho_pipeline.commands.orthos.verifying import displacements, document_of, provenance_of
+from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.scene_fit import by_matches
@@ -26,7 +27,7 @@ from ortho_pipeline.estimation.spatial.displacement_field import DisplacementFie
 from ortho_pipeline.estimation.statistics import chance_of_mean
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
-from ortho_pipeline.files import retire, staged, together, write_json
+from ortho_pipeline.files import retire, staged, states, together, write_json
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.matching.matcher import held_out
 from ortho_pipeline.models import ImageCorrection, MapGrid, SensorModel, SmoothField
@@ -103,6 +104,8 @@ def align(
     _refuse_unusable(match, bending)
     output = OutputOptions(resampling="cubic") if output is None else output
     hidden = [ClassMask.parse(text) for text in masks]
+    request = Request(ortho, scene, match=match, output=output)
+    ledger = Ledger(begun=states([*(path for _, path in request.files), *(mask.path for mask in hidden)]))
     measured = measure_ortho(ortho, match, scene=scene, masks=hidden, band=band, output=output)
     before = Verified.of(measured).relative().to_json(measured.pixel)
     chosen = _choose(measured, shift_only or not resample, bending)
@@ -112,7 +115,6 @@ def align(
     for name, ending in (("model", "_aligned_model.json"), ("json", "_align.json"), ("html", "_align.html"),
                          ("displacements", "_displacements.geojson")):  # fmt: skip
         files[name] = Path(folder) / f"{stem}{ending}"
-    request = Request(ortho, scene, match=match, output=output)
     check_paths(files, request)
     record = provenance_of(request, measured.scene, None, hidden, command)
     # The masks show the ground where the ortho showed it before.
@@ -141,6 +143,7 @@ def align(
         write_model_file(SavedModel(chosen.model, measured.scene.sensor, str(ortho), size, {}), files["model"])
         access = scene.access | {"roots": (Path(ortho).parent, *scene.roots)}
         write_page(document, files["html"], staged(files["ortho"]), access)
+        ledger.require_unchanged()
     return Result(files, document, summary_text(document))
 
 
