@@ -208,7 +208,7 @@ def _fault(error: BaseException) -> OrthoError:
         )
         full.__cause__ = error
         return full
-    if isinstance(error, OSError) and error.errno in _NO_ACCESS and error.filename:
+    if isinstance(error, OSError) and error.errno in _NO_ACCESS and isinstance(error.filename, str | bytes):
         closed = InputError(
             f"cannot access this file or folder ({error.strerror})",
             file=os.fsdecode(error.filename),
