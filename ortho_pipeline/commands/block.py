@@ -23,8 +23,8 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, refuse_copies, scenes_of, start_of
 from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
 from ortho_pipeline.commands.block_results.orthos import (
+    OrthoPlan,
     adjusted_scenes,
-    corrected,
     make_orthos,
     mosaic_of_orthos,
     ortho_files,
@@ -39,7 +39,6 @@ from ortho_pipeline.commands.control.block_points import (
     relative_to_reference,
     settled_scenes,
 )
-from ortho_pipeline.commands.heights.opening import open_surface
 from ortho_pipeline.commands.rectification import no_rpc
 from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
@@ -155,6 +154,11 @@ def adjust(
     notes = [one for one in (*placed, *gathered.notices) if asked or one.code != "dem-sigma-by-default"]
     plain = {label: _plain(fit.models[label]) for label in labels}
     exported, complaints = _exported(plain, files)
+    plan = None
+    if orthos is not None:
+        over = adjusted_scenes(starts, fit, plain, files)
+        plan = OrthoPlan.of(over, fit, gathered.heights, (scenes[0], surface, orthos))
+        of_orthos, complaints = {label: of_orthos[label] for label in plan.scenes}, [*complaints, *plan.notices]
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     report = block_report.build_report(
         fit=fit,
@@ -170,10 +174,8 @@ def adjust(
         _write(files, report, fit, starts, exported, record)
         told = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0]).export(programs, Path(folder), files)
         failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
-        if orthos is not None:
-            ground = gathered.heights or open_surface(surface, scenes[0], under=[one.scene for one in starts.values()])
-            adjusted, options = adjusted_scenes(starts, fit, plain, files), (scenes[0], surface, orthos)
-            failed = make_orthos(adjusted, of_orthos, corrected(ground, fit), options, command, progress)
+        if plan is not None:
+            failed = make_orthos(plan, of_orthos, command, progress)
             failure = failure or next(iter(failed.values()), None)
             files |= {f"{label} {kind}": path for label, own in of_orthos.items() for kind, path in own.items()}
     text = Text.joined("\n", [block_report.summary_text(report), *gathered.text, *told])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import FrameCamera
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.options import MosaicOptions, OutputOptions
+from ortho_pipeline.options import MosaicOptions, OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.writing import write_dem
 
@@ -101,6 +102,30 @@ def test_all_images_outside_the_dem_are_named(tmp_path: Path) -> None:
     with pytest.raises(CoverageError, match=r"image far: .*no pixels\. .* either: farther") as error:
         orthos_of_blocks.on_one_grid(scenes, open_dem(tmp_path / "dem.tif", "ellipsoid", fill="mask"), OutputOptions())
     assert str(error.value.remedy).endswith("; or leave these images out")
+
+
+def test_with_masks_the_other_images_get_orthos(tmp_path: Path) -> None:
+    """One photo of two is west of the DEM: it has no ortho, and a notice."""
+    write_dem(tmp_path / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")
+    scenes = {}
+    for name, x in (("far", 299_100.0), ("near", 300_000.0)):
+        interior = Interior(600, 400, 0.006, 1e-5, 1e-5)
+        model = FrameCamera.from_map(interior, "EPSG:32651", [x, 2.7e6, 180.0, 0, 0, 0], frame="map", heights=(0, 100))
+        scenes[name] = Scene("frame", name, 600, 400, {"frame": model}, "table")
+    fit: Any = SimpleNamespace(heights=None)
+
+    def plan(fill: str, of: dict[str, Scene] = scenes) -> orthos_of_blocks.OrthoPlan:
+        surface = SurfaceOptions(dem=tmp_path / "dem.tif", vertical="ellipsoid", fill=fill)
+        return orthos_of_blocks.OrthoPlan.of(of, fit, None, (SceneOptions(), surface, OutputOptions()))
+
+    made = plan("mask")
+    assert list(made.scenes) == ["near"]
+    assert [str(notice) for notice in made.notices] == [
+        "image far: the DEM does not cover this image, so it has no ortho"
+    ]
+    for refused in (lambda: plan("error"), lambda: plan("mask", {"far": scenes["far"]})):
+        with pytest.raises(CoverageError, match="image far: "):
+            refused()
 
 
 def test_options_of_orthos_need_orthos(sample: Path, tmp_path: Path) -> None:

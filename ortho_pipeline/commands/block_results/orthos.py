@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands.control.points import no_points
-from ortho_pipeline.commands.heights.opening import require_geoid
+from ortho_pipeline.commands.heights.opening import open_surface, require_geoid
 from ortho_pipeline.commands.mosaic.assembly import mosaic as mosaic_of
 from ortho_pipeline.commands.mosaic.assembly import mosaic_files
 from ortho_pipeline.commands.rectification import OrthoJob, make_ortho
@@ -19,6 +19,7 @@ from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.results import Result, outputs
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import CoverageError, InputError, ReportError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs import map_crs
@@ -37,6 +38,47 @@ from ortho_pipeline.surface.footprint import ground_sample_distance, lay, output
 _NOT_AGAIN = ("model", "rpc", "vrt")
 #: Further images outside the heights that an error names.
 _NAMED = 20
+
+
+@dataclass(frozen=True)
+class OrthoPlan:
+    """The scenes that get orthos, their surface and options on one grid; notices of scenes that get none."""
+
+    scenes: Mapping[str, Scene]
+    surface: Surface
+    options: tuple[SceneOptions, SurfaceOptions, OutputOptions]
+    notices: list[Notice]
+
+    @classmethod
+    def of(
+        cls,
+        scenes: Mapping[str, Scene],
+        fit: BlockFit,
+        heights: Surface | None,
+        asked: tuple[SceneOptions, SurfaceOptions, OutputOptions],
+    ) -> OrthoPlan:
+        """Plan the orthos of adjusted scenes, on the heights of their block or else on those of the options.
+
+        With ``fill='mask'`` scenes outside the DEM get no ortho.
+
+        Raises
+        ------
+        InputError
+            As `open_surface` and `on_one_grid`.
+        """
+        options, surface, output = asked
+        ground = corrected(heights or open_surface(surface, options, under=scenes.values()), fit)
+        outside = []
+        if isinstance(ground, DemSurface) and ground.fill == "mask":
+            outside = [
+                name for name, one in scenes.items() if not lay(one.model, ground, one.width, one.height).coverage
+            ]
+        if len(outside) == len(scenes):
+            outside = []  # `on_one_grid` refuses them all
+        text = "the DEM does not cover this image, so it has no ortho"
+        notices = [Notice("dem-covers-part", text, coverage=0.0).in_image(name) for name in outside]
+        shown = {name: scene for name, scene in scenes.items() if name not in outside}
+        return cls(shown, ground, (options, surface, on_one_grid(shown, ground, output)), notices)
 
 
 def ortho_files(folder: Path, labels: Sequence[str], output: OutputOptions) -> dict[str, dict[str, Path]]:
@@ -125,32 +167,27 @@ def _named(outside: Mapping[str, CoverageError]) -> CoverageError:
 
 @cache_restored()
 def make_orthos(
-    scenes: Mapping[str, Scene],
-    files: Mapping[str, dict[str, Path]],
-    surface: Surface,
-    asked: tuple[SceneOptions, SurfaceOptions, OutputOptions],
-    command: str | None,
-    progress: Progress | None,
+    plan: OrthoPlan, files: Mapping[str, dict[str, Path]], command: str | None, progress: Progress | None
 ) -> dict[str, ReportError]:
-    """Make the orthos of adjusted scenes, and return the errors of reports by image.
+    """Make the planned orthos, and return the errors of reports by image.
 
     Raises
     ------
     InputError
         As `rectify`.
     """
-    options, heights, output = asked
+    scenes, surface, (options, heights, output) = plan.scenes, plan.surface, plan.options
     access = SceneOptions(allow_network=options.allow_network, roots=options.roots)
     limit_cache(output.memory, 1)
-    failed, shared = dict[str, ReportError](), on_one_grid(scenes, surface, output)
+    failed = dict[str, ReportError]()
     for number, (label, scene) in enumerate(scenes.items()):
 
         def stage(name: str, share: float, begun: int = number) -> None:
             if progress is not None:
                 progress(name, (begun + share) / len(scenes))
 
-        request = Request(scene, access, surface=heights, output=shared)
-        like = None if shared.like is None else grid_of(shared.like, **access.access)
+        request = Request(scene, access, surface=heights, output=output)
+        like = None if output.like is None else grid_of(output.like, **access.access)
         resolved = Resolved(request, scene, surface, no_points(), like, Ledger.of(request, scene, surface))
         made = make_ortho(resolved, files[label], OrthoJob(stage, command, label))
         if isinstance(made, ReportError):
