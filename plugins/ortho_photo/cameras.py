@@ -130,7 +130,7 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
     if dewarped is not None:
         return _agreeing(tags, dewarped, stated, "drone-dji:DewarpData")
     if by_pix4d is not None:
-        return by_pix4d
+        return _upright(tags, by_pix4d)
     if nominal := tags.positive("drone-dji:CalibratedFocalLength"):
         camera = PhotoCamera(_plain(width, height, nominal * width / full), "nominal focal length in pixels")
         if by_sensor is None or abs(camera.pixels / by_sensor.pixels - 1) > _ALIKE:
@@ -269,6 +269,20 @@ def _of_pix4d(tags: Tags, width: int, height: int, full: float) -> PhotoCamera |
     x0, y0 = (place[0] - middle[0]) * 1e-3, (middle[1] - place[1]) * 1e-3
     interior = Interior(width, height, focal * 1e-3, pixel, pixel, x0, y0, r1, r2, r3, t1, t2)
     return PhotoCamera(interior, "the maker's calibration (Pix4D's camera tags)", CALIBRATED)
+
+
+def _upright(tags: Tags, camera: PhotoCamera) -> PhotoCamera:
+    """Return a camera, unless its principal point is that of the photo before it was turned from landscape."""
+    frame = camera.interior
+    middle = frame.width * frame.pitch_x / 2, frame.height * frame.pitch_y / 2
+    place = middle[0] + frame.x0, middle[1] - frame.y0
+    if math.dist(place, middle[::-1]) < math.dist(place, middle) / 2:
+        raise tags.error(
+            f"the principal point is that of a photo of another shape than {frame.width} x {frame.height} pixels",
+            "Camera:PrincipalPoint",
+            _TURNED,
+        )
+    return camera
 
 
 def _pitch_mm(tags: Tags) -> float | None:

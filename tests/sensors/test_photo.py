@@ -400,6 +400,20 @@ def test_a_photo_that_a_program_turned_is_no_crop(tmp_path):
     assert "turned this photo" in error.value.remedy
 
 
+@pytest.mark.parametrize(("size", "place"), [((400, 600), "6.72,4.36"), ((600, 400), "4.36,6.72")])
+def test_a_principal_point_across_shows_a_turned_photo(tmp_path, size, place):
+    """A program turned the pixels and rewrote their size in EXIF; the principal point (mm) stayed."""
+    pix4d = {"Camera:PerspectiveFocalLength": "8.8", "Camera:PrincipalPoint": place}
+    plane = {"FocalPlaneXResolution": "45.4545", "FocalPlaneResolutionUnit": "4"}
+    exif = {**EXIF, **plane, "PixelXDimension": str(size[0]), "PixelYDimension": str(size[1])}
+    with pytest.raises(InputError, match=f"another shape than {size[0]} x {size[1]} pixels") as error:
+        opened(photo(tmp_path / "a.tif", exif, {**DJI, **pix4d}, size=size))
+    assert "turned this photo" in error.value.remedy
+    assert error.value.field == "Camera:PrincipalPoint"
+    exif |= {"PixelXDimension": str(size[1]), "PixelYDimension": str(size[0])}
+    opened(photo(tmp_path / "b.tif", exif, {**DJI, **pix4d}, size=size[::-1]))
+
+
 def test_the_optical_centre_shows_a_crop(tmp_path):
     exif = {**EXIF, "PixelXDimension": "300", "PixelYDimension": "300"}
     path = photo(tmp_path / "a.tif", exif, {**DJI, **DEWARP, **CENTRE}, size=(300, 300))
