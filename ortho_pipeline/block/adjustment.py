@@ -14,7 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from ortho_pipeline.block.datum import HOLD, by_control, stated_accuracies, with_datum, with_start_errors
-from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
+from ortho_pipeline.block.determination import (
+    naming_wrong_points,
+    refuse_too_few,
+    refuse_undetermined,
+    uncertain_images,
+)
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
@@ -128,7 +133,8 @@ def adjust(
     error = BlockCommonError.of(problem, state, selection)
     shared = SharedUnknowns(error, dem_heights, SharedPriors.of(problem, priors or {}))
     problem = shared.applied(problem)
-    solved, inside, shared = _first(problem, state, selection, whole, shared, robust)
+    with naming_wrong_points(problem, state, selection):
+        solved, inside, shared = _first(problem, state, selection, whole, shared, robust)
     rejected, near, searched = tuple[GrossError, ...](), solved.state, inside
     if robust and problem.size and solved.unit_weight()[1] >= 4:
         blunders = find_blunders(solved, inside)
@@ -213,13 +219,19 @@ def _refuse_many_outside(problem: BlockProblem, outside: Mask, inside: Selection
     number = int((outside & of).sum())
     if number > _MOST * of.sum():
         low, high = (side(model.height_limits[k] for model in problem.models) for k, side in ((0, max), (1, min)))
-        raise DegeneratePoints(
-            f"the rays of {number} of {counted(int(of.sum()), 'point')} are parallel or meet outside of their models "
-            f"(heights {low:.0f} to {high:.0f} m). Without control points, heights depend on the models of the images, "
-            "which are not accurate enough here",
-            file=problem.points.source or None,
-            remedy="give control points that two images show, or a DEM: they fix the heights of the block",
+        heights = f" (heights {low:.0f} to {high:.0f} m)" if math.isfinite(high - low) else ""
+        text = (
+            f"the rays of {number} of {counted(int(of.sum()), 'point')} are parallel or meet outside of their "
+            f"models{heights}"
         )
+        remedy = "give control points that two images show"
+        if problem.heights is None:
+            text += (
+                ". Without control points, heights depend on the models of the images, which are not accurate enough "
+                "here"
+            )
+            remedy += ", or a DEM: they fix the heights of the block"
+        raise DegeneratePoints(text, file=problem.points.source or None, remedy=remedy)
 
 
 def _checked_accuracies(accuracies: Mapping[str, float], points: BlockPoints) -> Mapping[str, float]:

@@ -2,22 +2,57 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.elimination import weakest
-from ortho_pipeline.block.equations.problem import BlockProblem, Selection
+from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
 from ortho_pipeline.block.equations.solver import Solved
+from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import significant
-from ortho_pipeline.errors import DegeneratePoints, TooFewPoints
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
+from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.determinacy import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.models.base import Array
+
+#: At the start, rays that miss their point by so many times the median, and their own sigma, may be wrong.
+_FAR, _SURE = 2.0, 20.0
+#: Points that an error names.
+_NAMED = 10
+
+
+@contextlib.contextmanager
+def naming_wrong_points(problem: BlockProblem, start: State, selection: Selection) -> Iterator[None]:
+    """Add the points whose rays miss each other most at the start to an error of the first solution.
+
+    A few rays that are wrong by hundreds of pixels lead the first solution astray, before gross errors can be found.
+    """
+    try:
+        yield
+    except (DegeneratePoints, NotConverged) as error:
+        points = problem.points
+        missed = np.hypot(*(points.measured - predict(problem.frame, start.models, points, start.local)).T)
+        missed[~(selection.rays & np.isfinite(missed))] = 0.0
+        worst = np.zeros(len(points))
+        np.maximum.at(worst, points.point, np.where(missed > _SURE * points.sigma_image, missed, 0.0))
+        median = float(np.median(worst[np.unique(points.point)]))
+        named = [int(k) for k in np.argsort(-worst)[:_NAMED] if worst[k] > _FAR * median]
+        if not named:
+            raise
+        each = ", ".join(f"{points.ids[k]} ({worst[k]:.0f} px)" for k in named)
+        raise type(error)(
+            Text(error.message, f". Wrong points can be the cause: before the adjustment, rays miss most at {each}"),
+            file=error.file,
+            field=error.field,
+            remedy=Text("check these points first, and delete wrong ones; or ", error.remedy or ""),
+        ) from error
 
 
 def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:

@@ -13,7 +13,12 @@ from chains import ORIGIN, Chain, fly
 
 from ortho_pipeline.block import determination
 from ortho_pipeline.block.adjustment import _prepared
-from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
+from ortho_pipeline.block.determination import (
+    naming_wrong_points,
+    refuse_too_few,
+    refuse_undetermined,
+    uncertain_images,
+)
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
 from ortho_pipeline.block.equations.unknowns import Columns
@@ -236,3 +241,18 @@ def test_a_corner_that_is_twice_as_uncertain_as_the_points_is_told_beside_them(
         found = uncertain_images(solved, problem.points.with_image_sigmas(np.full(problem.points.rays, 0.01)), whole)  # type: ignore[arg-type]
         assert len(found) == 2
         assert all(text in str(one) for one in found)
+
+
+@pytest.mark.parametrize("wrong", [0, 2])
+def test_errors_of_the_first_solution_name_points_that_miss_at_the_start(prepared: Prepared, wrong: int) -> None:
+    problem, state, selection = prepared
+    points, measured = problem.points, problem.points.measured.copy()
+    for number in range(wrong):
+        measured[np.flatnonzero(points.point == number)[0]] += 400.0 + 200.0 * number
+    apart = replace(problem, points=replace(points, measured=measured))
+    with pytest.raises(DegeneratePoints, match=r"^astray") as error, naming_wrong_points(apart, state, selection):
+        raise DegeneratePoints("astray", remedy="give more points")
+    named = [name for name in points.ids if f"{name} (" in str(error.value.message)]
+    assert named == list(points.ids[:wrong])
+    remedy = "check these points first, and delete wrong ones; or give more points" if wrong else "give more points"
+    assert str(error.value.remedy) == remedy
