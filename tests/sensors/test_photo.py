@@ -549,6 +549,18 @@ def test_a_folder_stands_for_its_photos_and_says_what_they_lack(tmp_path):
     assert "no camera angles" in shown
 
 
+def test_photos_in_formats_that_are_not_read_are_named_unless_they_have_a_copy(tmp_path):
+    for name in ("a.DNG", "b.dng", "c.HEIC", "notes.txt"):
+        (tmp_path / name).write_bytes(b"II*\0")
+    with pytest.raises(InputError, match=r"0 scenes.*; a.DNG: photos in this format are not read.*; b.dng: .*; c.HEIC"):
+        images_of([tmp_path], SceneOptions())
+    photo(tmp_path / "a.TIF")
+    photo(tmp_path / "b.tif", {**EXIF, "GPSAltitude": "(1001)"})
+    found, [notice] = images_of([tmp_path], SceneOptions())
+    assert [Path(path).name for path in found] == ["a.TIF", "b.tif"]
+    assert notice.fields["images"] == ["c.HEIC"]
+
+
 def test_photos_that_do_not_overlap_are_an_error(tmp_path):
     far = {**EXIF, "GPSLongitude": "(33) (45) (0)"}
     files = [str(photo(tmp_path / "a.tif")), str(photo(tmp_path / "b.tif", far, without(DJI, "Gps")))]

@@ -52,6 +52,8 @@ IMAGES = (
 NO_DATUM = "no height datum declared"
 #: Those of them that hold pixels and nothing else: such a file that does not open is damaged.
 _PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img", ".png", ".jpg", ".jpeg")
+#: Photos that cannot be read as they are.
+_RAW = (".dng", ".heic", ".heif", ".arw", ".cr2", ".cr3", ".nef", ".raf", ".orf", ".rw2")
 #: Files that are looked at, and folders below the given one.
 _MOST, _DEPTH = 2000, 3
 #: Images that a notice names.
@@ -199,8 +201,17 @@ def _looked_at(path: Path, folder: Path, options: SceneOptions) -> SurveyedFile 
     suffix, name = path.suffix.lower(), str(path.relative_to(folder))
     if suffix in IMAGES:
         return _image(path, folder, options)
+    if suffix in _RAW and not _has_copy(path):
+        return SurveyedFile(
+            name, "image", "photos in this format are not read. Convert them to JPEG, and keep the tags"
+        )
     # JSON files are mostly reports and models.
     return _points(path, name) if suffix in SUFFIXES and suffix != ".json" else None
+
+
+def _has_copy(path: Path) -> bool:
+    """Return whether the camera wrote this photo in another format, too."""
+    return any(path.with_suffix(case).exists() for ending in _PIXELS for case in (ending, ending.upper()))
 
 
 def _is_ours(path: Path) -> bool:
