@@ -133,8 +133,7 @@ def adjust(
     error = BlockCommonError.of(problem, state, selection)
     shared = SharedUnknowns(error, dem_heights, SharedPriors.of(problem, priors or {}))
     problem = shared.applied(problem)
-    with naming_wrong_points(problem, state, selection):
-        solved, inside, shared = _first(problem, state, selection, whole, shared, robust)
+    solved, inside, shared = _first(problem, state, selection, whole, shared, robust)
     rejected, near, searched = tuple[GrossError, ...](), solved.state, inside
     if robust and problem.size and solved.unit_weight()[1] >= 4:
         blunders = find_blunders(solved, inside)
@@ -177,10 +176,11 @@ def _first(
     solved = attempt(problem, state, whole, tolerance)
     held = _held(solved, state, selection, whole) if robust else None
     near = solved if held is None else held
-    if near.astray is not None:
-        _refuse_many_outside(problem, near.astray, near.without_astray(whole), whole)
-    solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
-    solved, shared = shared.near(solved, inside)
+    with naming_wrong_points(problem, state, selection):
+        if near.astray is not None:
+            _refuse_many_outside(problem, near.astray, near.without_astray(whole), whole)
+        solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
+        solved, shared = shared.near(solved, inside)
     if problem.unstated.any():
         solved = reweighed(solved, inside, estimate(solved), tolerance)
     return solved, inside, shared

@@ -23,11 +23,10 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, refuse_copies, scenes_of, start_of
 from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
 from ortho_pipeline.commands.block_results.orthos import (
-    OrthoPlan,
-    adjusted_scenes,
     make_orthos,
     mosaic_of_orthos,
     ortho_files,
+    planned,
     with_mosaic,
 )
 from ortho_pipeline.commands.block_results.other_programs import AdjustedBlock, block_formats, files_for
@@ -154,11 +153,8 @@ def adjust(
     notes = [one for one in (*placed, *gathered.notices) if asked or one.code != "dem-sigma-by-default"]
     plain = {label: _plain(fit.models[label]) for label in labels}
     exported, complaints = _exported(plain, files)
-    plan = None
-    if orthos is not None:
-        over = adjusted_scenes(starts, fit, plain, files)
-        plan = OrthoPlan.of(over, fit, gathered.heights, (scenes[0], surface, orthos))
-        of_orthos, complaints = {label: of_orthos[label] for label in plan.scenes}, [*complaints, *plan.notices]
+    plan = planned(starts, fit, plain, files, of_orthos, gathered.heights, (scenes[0], surface, orthos))
+    complaints += [] if plan is None else plan.notices
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     report = block_report.build_report(
         fit=fit,
@@ -175,12 +171,11 @@ def adjust(
         told = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0]).export(programs, Path(folder), files)
         failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
         if plan is not None:
-            failed = make_orthos(plan, of_orthos, command, progress)
-            failure = failure or next(iter(failed.values()), None)
-            files |= {f"{label} {kind}": path for label, own in of_orthos.items() for kind, path in own.items()}
+            failure = next(filter(None, (failure, *make_orthos(plan, command, progress).values())), None)
+            files |= {f"{label} {kind}": path for label, own in plan.files.items() for kind, path in own.items()}
     text = Text.joined("\n", [block_report.summary_text(report), *gathered.text, *told])
     result = Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
-    return result if mosaic is None else with_mosaic(result, of_orthos, of_mosaic["mosaic"]["mosaic"], mosaic)
+    return result if mosaic is None or plan is None else with_mosaic(result, plan.files, of_mosaic, mosaic)
 
 
 @with_items

@@ -116,10 +116,11 @@ def test_with_masks_the_other_images_get_orthos(tmp_path: Path) -> None:
 
     def plan(fill: str, of: dict[str, Scene] = scenes) -> orthos_of_blocks.OrthoPlan:
         surface = SurfaceOptions(dem=tmp_path / "dem.tif", vertical="ellipsoid", fill=fill)
-        return orthos_of_blocks.OrthoPlan.of(of, fit, None, (SceneOptions(), surface, OutputOptions()))
+        files = {name: {"ortho": tmp_path / name} for name in of}
+        return orthos_of_blocks.OrthoPlan.of(of, files, fit, None, (SceneOptions(), surface, OutputOptions()))
 
     made = plan("mask")
-    assert list(made.scenes) == ["near"]
+    assert list(made.scenes) == list(made.files) == ["near"]
     assert [str(notice) for notice in made.notices] == [
         "image far: the DEM does not cover this image, so it has no ortho"
     ]
@@ -146,7 +147,9 @@ def test_a_mosaic_that_fails_costs_no_ortho(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(orthos_of_blocks, "mosaic_of", refuse)
     orthos = {"a": {"ortho": tmp_path / "a_ortho.tif"}}
-    result = orthos_of_blocks.with_mosaic(Result(orthos, {}, "text"), orthos, tmp_path / "mosaic.tif", MosaicOptions())
+    result = orthos_of_blocks.with_mosaic(
+        Result(orthos, {}, "text"), orthos, {"mosaic": {"mosaic": tmp_path / "mosaic.tif"}}, MosaicOptions()
+    )
     assert result.files == orthos
     assert "differ in their bands" in str(result.failure)
 

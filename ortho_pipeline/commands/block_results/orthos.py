@@ -42,9 +42,10 @@ _NAMED = 20
 
 @dataclass(frozen=True)
 class OrthoPlan:
-    """The scenes that get orthos, their surface and options on one grid; notices of scenes that get none."""
+    """The scenes that get orthos, their outputs, surface and options on one grid; notices of scenes that get none."""
 
     scenes: Mapping[str, Scene]
+    files: Mapping[str, dict[str, Path]]
     surface: Surface
     options: tuple[SceneOptions, SurfaceOptions, OutputOptions]
     notices: list[Notice]
@@ -53,6 +54,7 @@ class OrthoPlan:
     def of(
         cls,
         scenes: Mapping[str, Scene],
+        files: Mapping[str, dict[str, Path]],
         fit: BlockFit,
         heights: Surface | None,
         asked: tuple[SceneOptions, SurfaceOptions, OutputOptions],
@@ -78,7 +80,8 @@ class OrthoPlan:
         text = "the DEM does not cover this image, so it has no ortho"
         notices = [Notice("dem-covers-part", text, coverage=0.0).in_image(name) for name in outside]
         shown = {name: scene for name, scene in scenes.items() if name not in outside}
-        return cls(shown, ground, (options, surface, on_one_grid(shown, ground, output)), notices)
+        of_shown = {name: files[name] for name in shown}
+        return cls(shown, of_shown, ground, (options, surface, on_one_grid(shown, ground, output)), notices)
 
 
 def ortho_files(folder: Path, labels: Sequence[str], output: OutputOptions) -> dict[str, dict[str, Path]]:
@@ -121,6 +124,23 @@ def corrected(surface: Surface, fit: BlockFit) -> Surface:
         return surface
     east, north = heights.shift_m if heights.shift_applied else (0.0, 0.0)
     return moved(surface, (-east, -north, -heights.mean_error_m), np.nanmedian(fit.ground[:, :2], axis=0))
+
+
+def planned(
+    starts: Mapping[str, Start],
+    fit: BlockFit,
+    models: Mapping[str, SensorModel],
+    files: Mapping[str, Path],
+    of_orthos: Mapping[str, dict[str, Path]],
+    heights: Surface | None,
+    asked: tuple[SceneOptions, SurfaceOptions, OutputOptions | None],
+) -> OrthoPlan | None:
+    """Return the plan of the orthos of a block; None where none are asked for."""
+    options, surface, output = asked
+    if output is None:
+        return None
+    scenes = adjusted_scenes(starts, fit, models, files)
+    return OrthoPlan.of(scenes, of_orthos, fit, heights, (options, surface, output))
 
 
 def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOptions) -> OutputOptions:
@@ -166,9 +186,7 @@ def _named(outside: Mapping[str, CoverageError]) -> CoverageError:
 
 
 @cache_restored()
-def make_orthos(
-    plan: OrthoPlan, files: Mapping[str, dict[str, Path]], command: str | None, progress: Progress | None
-) -> dict[str, ReportError]:
+def make_orthos(plan: OrthoPlan, command: str | None, progress: Progress | None) -> dict[str, ReportError]:
     """Make the planned orthos, and return the errors of reports by image.
 
     Raises
@@ -189,7 +207,7 @@ def make_orthos(
         request = Request(scene, access, surface=heights, output=output)
         like = None if output.like is None else grid_of(output.like, **access.access)
         resolved = Resolved(request, scene, surface, no_points(), like, Ledger.of(request, scene, surface))
-        made = make_ortho(resolved, files[label], OrthoJob(stage, command, label))
+        made = make_ortho(resolved, plan.files[label], OrthoJob(stage, command, label))
         if isinstance(made, ReportError):
             failed[label] = made
     return failed
@@ -212,10 +230,15 @@ def mosaic_of_orthos(
     return {"mosaic": mosaic_files(folder / "mosaic.tif")}
 
 
-def with_mosaic(result: Result, orthos: Mapping[str, Mapping[str, Path]], path: Path, options: MosaicOptions) -> Result:
+def with_mosaic(
+    result: Result,
+    orthos: Mapping[str, Mapping[str, Path]],
+    of_mosaic: Mapping[str, Mapping[str, Path]],
+    options: MosaicOptions,
+) -> Result:
     """Return the result of a block with a mosaic of its orthos, or with the reason why there is none."""
     try:
-        made = mosaic_of([files["ortho"] for files in orthos.values()], path, options)
+        made = mosaic_of([files["ortho"] for files in orthos.values()], of_mosaic["mosaic"]["mosaic"], options)
     except InputError as error:
         why = Text("the mosaic could not be made (", error.message, "); the other outputs are complete")
         return Result(result.files, result.document, result.summary, ReportError(why, remedy=error.remedy))
