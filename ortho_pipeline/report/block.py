@@ -315,12 +315,12 @@ def sigma_lines(report: BlockReport) -> list[str]:
 
 
 def _absolute(fit: BlockFit) -> AbsoluteAccuracy | None:
-    # The sigmas of points do not contain the errors of models that are not adjusted.
-    if not fit.parameters:
+    known = np.isfinite(fit.ground_sigmas).all(axis=1)
+    # Sigmas of points lack the errors of models that are not adjusted. Matched control counts as exact to a millimetre.
+    if not fit.parameters or not known.any():
         return None
-    sigmas = fit.ground_sigmas[np.isfinite(fit.ground_sigmas).all(axis=1)]
-    if not len(sigmas):
-        return None
+    free = known & ~fit.used_ground
+    sigmas = fit.ground_sigmas[free if free.any() else known]
     east, north, up = np.median(sigmas, axis=0).tolist()
     return AbsoluteAccuracy(east_m=east, north_m=north, height_m=up, points=len(sigmas))
 

@@ -29,6 +29,7 @@ from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.report import block as block_report
 
 GEODETIC = "EPSG:4979"
 
@@ -452,3 +453,13 @@ def test_angles_of_rays_are_between_all_pairs_of_a_point() -> None:
     assert found == pytest.approx({(0, 2): 30.0, (0, 3): 0.0, (2, 3): 30.0, (1, 4): 0.0}, abs=1e-5)
     directions[2] = np.nan
     assert len(ray_angles(point, directions)[0]) == 2
+
+
+@pytest.mark.parametrize(("ties", "sigma"), [(2, 3.0), (0, 0.001)])
+def test_the_expected_accuracy_is_that_of_points_other_than_control(ties: int, sigma: float) -> None:
+    """Control that was matched with a reference counts as exact to a millimetre, and there is much of it."""
+    sigmas = np.concatenate([np.full((9, 3), 0.001), np.full((ties, 3), 3.0), np.full((1, 3), np.nan)])
+    fit: Any = SimpleNamespace(parameters=(("a", "b0"),), ground_sigmas=sigmas, used_ground=np.arange(len(sigmas)) < 9)
+    found = block_report._absolute(fit)
+    assert found is not None
+    assert (found.east_m, found.north_m, found.height_m, found.points) == (sigma, sigma, sigma, ties or 9)
