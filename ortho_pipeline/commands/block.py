@@ -20,7 +20,7 @@ from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.block_images import labels_of, refuse_copies, scenes_of, start_of
+from ortho_pipeline.commands.block_images import labels_of, refuse_copies, scenes_of, start_of, state_of_files
 from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
 from ortho_pipeline.commands.block_results.orthos import (
     make_orthos,
@@ -51,7 +51,7 @@ from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
-from ortho_pipeline.files import together, write_json, write_text
+from ortho_pipeline.files import retire, together, write_json, write_text
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import (
@@ -136,6 +136,7 @@ def adjust(
     programs = block_formats(export)
     written = of_orthos | of_mosaic | ({"export": files_for(programs, Path(folder), labels)} if programs else {})
     _check_paths(files, images, points, scenes, *models, match=match, surface=surface, further=written)
+    begun = state_of_files(images, points, scenes, match, surface)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     refuse_copies(images, scenes)
     gathered = gather(images, labels, scenes, points, match, surface)
@@ -173,6 +174,8 @@ def adjust(
         if plan is not None:
             failure = next(filter(None, (failure, *make_orthos(plan, command, progress).values())), None)
             files |= {f"{label} {kind}": path for label, own in plan.files.items() for kind, path in own.items()}
+            retire(plan.obsolete)
+        begun.require_unchanged()
     text = Text.joined("\n", [block_report.summary_text(report), *gathered.text, *told])
     result = Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
     return result if mosaic is None or plan is None else with_mosaic(result, plan.files, of_mosaic, mosaic)

@@ -14,13 +14,16 @@ import numpy as np
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, fit_family
+from ortho_pipeline.files import states
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, families, family_of, start_model
-from ortho_pipeline.options import BlockOptions, SceneOptions
+from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.formats import names_image
 
@@ -256,3 +259,17 @@ def _family_start(
         getattr(model, "family", name),
         f"{counted(control, 'control point')} of {Path(table.source).name}",
     )
+
+
+def state_of_files(
+    images: Sequence[str | os.PathLike[str]],
+    options: BlockOptions,
+    scenes: Sequence[SceneOptions],
+    match: MatchOptions,
+    surface: SurfaceOptions,
+) -> Ledger:
+    """Return how the files that the user named are now."""
+    requests = [Request(image, own) for image, own in zip(images, scenes, strict=True)]
+    for file in (options.points, options.gcps, options.spot_heights):
+        requests.append(Request(images[0], scenes[0], PointOptions(gcps=file), surface, match))
+    return Ledger(begun=states(path for request in requests for _, path in request.files))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import html
 import json
+import os
 import re
 import shutil
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from servers import moto_server
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands import block
 from ortho_pipeline.commands.block_images import labels_of, points_of_images, refuse_copies
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError, DatumError, InputError
@@ -154,6 +157,25 @@ def test_adjust_writes_models_points_rpcs_and_one_report(stereo: Stereo, tmp_pat
     assert adjustment["object_rms"]["check"]["n"] == 12
     assert adjustment["object_rms"]["check"]["plan"] < 2.5
     assert "8 control points" in adjustment["gauge"]
+
+
+@pytest.mark.parametrize("which", ["points", "image"])
+def test_files_that_change_during_an_adjustment_end_it(
+    stereo: Stereo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, which: str
+) -> None:
+    points, images = stereo.write(), stereo.images
+    changing = points if which == "points" else images[1]
+    adjust_block = block.adjust_block
+
+    def changed(*given: Any, **more: Any) -> Any:
+        os.utime(changing, ns=(1, 1))
+        return adjust_block(*given, **more)
+
+    monkeypatch.setattr(block, "adjust_block", changed)
+    done = CliRunner().invoke(cli, ["adjust", *map(str, images), "--points", str(points), "-o", str(tmp_path / "out")])
+    assert done.exit_code == 2
+    assert f"{changing}: this file changed during the run" in done.output
+    assert not (tmp_path / "out").exists()
 
 
 def test_adjust_names_the_images_of_a_folder_that_it_leaves_out(stereo: Stereo, tmp_path: Path) -> None:

@@ -121,6 +121,7 @@ def test_with_masks_the_other_images_get_orthos(tmp_path: Path) -> None:
 
     made = plan("mask")
     assert list(made.scenes) == list(made.files) == ["near"]
+    assert made.obsolete == [tmp_path / "far"]
     assert [str(notice) for notice in made.notices] == [
         "image far: the DEM does not cover this image, so it has no ortho"
     ]

@@ -42,13 +42,17 @@ _NAMED = 20
 
 @dataclass(frozen=True)
 class OrthoPlan:
-    """The scenes that get orthos, their outputs, surface and options on one grid; notices of scenes that get none."""
+    """The scenes that get orthos, their outputs, surface and options on one grid.
+
+    Of scenes that get none: notices, and outputs of earlier runs.
+    """
 
     scenes: Mapping[str, Scene]
     files: Mapping[str, dict[str, Path]]
     surface: Surface
     options: tuple[SceneOptions, SurfaceOptions, OutputOptions]
     notices: list[Notice]
+    obsolete: list[Path]
 
     @classmethod
     def of(
@@ -81,7 +85,8 @@ class OrthoPlan:
         notices = [Notice("dem-covers-part", text, coverage=0.0).in_image(name) for name in outside]
         shown = {name: scene for name, scene in scenes.items() if name not in outside}
         of_shown = {name: files[name] for name in shown}
-        return cls(shown, of_shown, ground, (options, surface, on_one_grid(shown, ground, output)), notices)
+        obsolete = [path for name in outside for path in files[name].values()]
+        return cls(shown, of_shown, ground, (options, surface, on_one_grid(shown, ground, output)), notices, obsolete)
 
 
 def ortho_files(folder: Path, labels: Sequence[str], output: OutputOptions) -> dict[str, dict[str, Path]]:
