@@ -51,7 +51,7 @@ from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
-from ortho_pipeline.files import retire, together, write_json, write_text
+from ortho_pipeline.files import together, write_json, write_text
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import (
@@ -166,15 +166,13 @@ def adjust(
         join_limit=points.join_limit,
         dem_unused=surface.dem is not None and points.dem_heights == "off",
     )
-    pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
         _write(files, report, fit, starts, exported, record)
         told = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0]).export(programs, Path(folder), files)
-        failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
+        failure = attempted(lambda: _write_report(files, report, _pictures(starts, scenes[0])), files, "report", "html")
         if plan is not None:
             failure = next(filter(None, (failure, *make_orthos(plan, command, progress).values())), None)
             files |= {f"{label} {kind}": path for label, own in plan.files.items() for kind, path in own.items()}
-            retire(plan.obsolete)
         begun.require_unchanged()
     text = Text.joined("\n", [block_report.summary_text(report), *gathered.text, *told])
     result = Result(files, {"report": report.to_json(), **gathered.document}, text, failure)

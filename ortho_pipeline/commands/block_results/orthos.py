@@ -22,6 +22,7 @@ from ortho_pipeline.commands.results import Result, outputs
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import CoverageError, InputError, ReportError
 from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.files import retire
 from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import Scene
@@ -203,6 +204,7 @@ def make_orthos(plan: OrthoPlan, command: str | None, progress: Progress | None)
     access = SceneOptions(allow_network=options.allow_network, roots=options.roots)
     limit_cache(output.memory, 1)
     failed = dict[str, ReportError]()
+    retire(plan.obsolete)
     for number, (label, scene) in enumerate(scenes.items()):
 
         def stage(name: str, share: float, begun: int = number) -> None:
