@@ -85,6 +85,34 @@ def test_the_date_of_a_list_counts_wherever_else_the_image_was_given(tmp_path):
         ]
 
 
+def test_assets_of_one_name_have_the_ids_of_their_items(tmp_path):
+    for number, name in enumerate(("x/S2_1", "x:S2 2", "B04_3", "x/S2_1_4")):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        ortho(folder / ("B04_3.tif" if number == 2 else "B04.tif"))
+        properties = {"datetime": f"2020-01-0{number + 1}T00:00:00Z"}
+        asset = {"href": "B04_3.tif" if number == 2 else "B04.tif"}
+        item = {
+            "type": "Feature",
+            "stac_version": "1.0.0",
+            "id": name,
+            "properties": properties,
+            "assets": {"b": asset},
+        }
+        (folder / "item.json").write_text(json.dumps(item))
+    (tmp_path / "list.csv").write_text(
+        "file,date\n0/item.json#b,2020-01-05\n1/item.json,\n2/item.json,\n3/item.json,\n"
+    )
+    names = ["x_S2_1_B04", "x_S2_2_B04", "B04_3", "x_S2_1_4_B04"]
+    for given in (["*/item.json#b"], ["[0-9]/item.json", "0/B04.tif"], [f"{number}/item.json" for number in range(4)]):
+        assert [one.name for one in dated_orthos([tmp_path / one for one in given])] == names
+    found = dated_orthos([tmp_path / "list.csv", tmp_path / "0" / "B04.tif"])
+    assert [one.name for one in found] == [*names[1:], names[0]]
+    with pytest.raises(InputError, match="two images are called B04") as caught:
+        dated_orthos([tmp_path / "*" / "B04.tif"])
+    assert "STAC item" in str(caught.value.remedy)
+
+
 def test_an_image_with_two_dates_in_lists_is_refused(tmp_path):
     for name in "ab":
         ortho(tmp_path / f"{name}.tif")
@@ -130,6 +158,7 @@ def test_an_ortho_without_a_date_is_an_error(tmp_path):
         ("20240503_to_20240503.tif", "%Y%m%d", "2024-05-03"),
         # The day of acquisition is before that of processing.
         ("LC08_L2SP_175032_20240123_20240201_02_T1.tif", "%Y%m%d", "2024-01-23"),
+        ("LC08_L2SP_175032_20240123_20240201_02_T1.tif", "_%Y%m%d_", "2024-01-23"),
     ],
 )
 def test_patterns(name, pattern, day):
@@ -140,7 +169,7 @@ def test_patterns(name, pattern, day):
     ("name", "pattern"),
     [
         ("a.tif", "%Y"), ("a_2020.tif", "%q"), ("a_20201399.tif", "%Y%m%d"), ("a_81750322.tif", "%Y%m%d"),
-        ("a_920200101920210101.tif", "%Y%m%d"),
+        ("a_920200101920210101.tif", "%Y%m%d"), ("a_2023366.tif", "%Y%j"), ("a_20240503.tif", "%Y%M%d"),
     ],
 )  # fmt: skip
 def test_patterns_that_do_not_fit_are_refused(name, pattern):
@@ -151,6 +180,9 @@ def test_patterns_that_do_not_fit_are_refused(name, pattern):
 def test_what_is_no_date_or_list_is_refused(tmp_path):
     with pytest.raises(InputError, match="not a date"):
         time_of("yesterday")
+    # Programs write this for an unknown time.
+    with pytest.raises(InputError, match="not a date from 1900 to 2100"):
+        time_of("0001-01-01T00:00:00Z")
     (tmp_path / "list.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match="no column of files"):
         read_list(tmp_path / "list.csv")

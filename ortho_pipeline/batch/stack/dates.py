@@ -8,7 +8,7 @@ import glob
 import io
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,7 +25,6 @@ from ortho_pipeline.commands.placement import Placement, place_scene
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
-from ortho_pipeline.commands.stac.given import resolved
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import decoded, read_bounded, read_json
@@ -34,6 +33,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.stores.sidecars import ask_beside
+from ortho_pipeline.stores.stac.item import read_item
 
 #: A list and a JSON document next to an ortho are no larger.
 _BYTES = 50_000_000
@@ -49,7 +49,9 @@ _ITEMS = (
 _WRITTEN = "TIFFTAG_DATETIME"
 _PARTS = {"%Y": r"(?P<Y>\d{4})", "%m": r"(?P<m>\d{2})", "%d": r"(?P<d>\d{2})", "%j": r"(?P<j>\d{3})",
           "%H": r"(?P<H>\d{2})", "%M": r"(?P<M>\d{2})", "%S": r"(?P<S>\d{2})", "%%": "%"}  # fmt: skip
-#: Numbers in names that are years of other times are no dates.
+#: Which part of a date a part is within, if not the year: %M is not the month.
+_WITHIN = {"%d": "%m", "%M": "%H", "%S": "%M"}
+#: Numbers in names that are years of other times are no dates, nor are times that programs write for unknown ones.
 _YEARS = range(1900, 2101)
 
 
@@ -135,13 +137,8 @@ def dated_orthos(
     InputError
         If an image has no date or two, two have one name, or one is raw and there are no heights.
     """
-    found: dict[str, _Given] = {}
     heights, skipped = has_surface(surface), {_real(path) for path in dem_files(surface)}
-    for one in _files(given, options):
-        if _real(one.path) in skipped:
-            continue
-        key = key_of_name(one.path.stem)
-        found[key] = found[key].completed(one) if key in found else one
+    found = _each_once(one for one in _files(given, options) if _real(one.path) not in skipped)
     if len(found) < 2:
         raise InputError(
             f"a stack needs at least two images, not {len(found)}",
@@ -149,7 +146,7 @@ def dated_orthos(
             remedy=f"give a folder with orthos ({', '.join(RASTERS)})",
         )
     dated = []
-    for one in found.values():
+    for one in found:
         path = one.path
         scene = open_ortho(path, options, only=False)
         if scene.sensor != ORTHO and not heights:
@@ -163,7 +160,7 @@ def dated_orthos(
         time, source = _date(one, pattern, documents, dataset, scene)
         facts = [*(_facts_of(document) for document, _ in documents), scene.facts]
         conditions = conditions_of(facts, dataset)
-        dated.append(Dated(path.stem, path, time, source, scene, conditions=conditions))
+        dated.append(Dated(one.name, path, time, source, scene, conditions=conditions))
     return sorted(dated, key=lambda one: (one.time, one.name))
 
 
@@ -181,11 +178,18 @@ def placed_at(name: str | os.PathLike[str], options: SceneOptions) -> Place:
 
 @dataclass(frozen=True)
 class _Given:
-    """An image that was given, with the date that a list states, and the STAC item that names it."""
+    """An image that was given, with the date that a list states, and the STAC item that names it, with its id."""
 
     path: Place
     stated: str | None = None
     item: Place | None = None
+    id: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name of its date; with the id of its item, because assets of all items may have one name, such as B04."""
+        stem = self.path.stem
+        return stem if stem.startswith(self.id) else f"{self.id}_{stem}"
 
     def completed(self, other: _Given) -> _Given:
         """Return an image that was given twice, with the date and the STAC item of either.
@@ -193,15 +197,8 @@ class _Given:
         Raises
         ------
         InputError
-            If the other one is another image of this name, or states another date.
+            If the other one states another date.
         """
-        if _real(self.path) != _real(other.path):
-            raise InputError(
-                f"two images are called {other.path.stem}",
-                file=other.path,
-                field="orthos",
-                remedy="rename one of them",
-            )
         if self.stated and other.stated and time_of(self.stated, self.path) != time_of(other.stated, self.path):
             raise InputError(
                 f"lists give this image two dates: {self.stated} and {other.stated}",
@@ -209,7 +206,32 @@ class _Given:
                 field="date",
                 remedy="delete the wrong row",
             )
-        return replace(self, stated=self.stated or other.stated, item=self.item or other.item)
+        return replace(self if other.item is None else other, stated=self.stated or other.stated)
+
+
+def _each_once(given: Iterable[_Given]) -> list[_Given]:
+    """Return images, each once.
+
+    Raises
+    ------
+    InputError
+        If two have one name, or one has two dates.
+    """
+    found: dict[tuple[str, str], _Given] = {}
+    for one in given:
+        key = key_of_name(one.path.stem), _real(one.path)
+        found[key] = found[key].completed(one) if key in found else one
+    names: set[str] = set()
+    for one in found.values():
+        if key_of_name(one.name) in names:
+            raise InputError(
+                f"two images are called {one.name}",
+                file=one.path,
+                field="orthos",
+                remedy="rename one of them, or give a STAC item of each",
+            )
+        names.add(key_of_name(one.name))
+    return list(found.values())
 
 
 def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> list[_Given]:
@@ -226,32 +248,29 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
             found += [_Given(file) for file in sorted(rasters, key=str)]
         elif path.suffix.lower() in (".csv", ".txt") and path.is_file():
             found += _listed(path, options)
-        elif name.is_item and path.is_file():
-            found.append(_of_item(name, options))
         elif not path.exists() and any(mark in name for mark in "*?["):
-            matches = sorted(glob.glob(name))
+            matches = sorted(glob.glob(os.fspath(path)))
             if not matches:
                 raise InputError("no file has such a name", file=path, field="orthos", remedy="check the pattern")
             # A pattern such as scenes/* has side-cars, too.
             images = [file for file in matches if Path(file).suffix.lower() in RASTERS]
-            found += [_Given(Path(file)) for file in images or matches]
+            asset = f"#{name.asset}" if name.asset else ""
+            found += [_one(Location(f"{file}{asset}"), options) for file in images or matches]
         else:
-            found.append(_Given(path))
+            found.append(_one(name, options))
     ask_beside(*(one.path for one in found), allow_network=options.allow_network)
     return found
 
 
 def _far_files(address: Location, options: SceneOptions) -> list[_Given]:
     """Return the images of an address: of an image, a STAC item, a list, a folder or pattern in object storage."""
-    if address.is_item:
-        return [_of_item(address, options)]
     ending = Path(address).suffix.lower()
     if ending in (".csv", ".txt"):
         return _listed(placed_at(address, options), options)
     # A web server has no patterns, and a query follows a question mark.
     is_pattern = not address.is_on_web and any(mark in address for mark in "*?[")
-    if not is_pattern and (address.is_on_web or (ending and not address.endswith("/"))):
-        return [_Given(placed_at(address, options))]
+    if address.is_item or (not is_pattern and (address.is_on_web or (ending and not address.endswith("/")))):
+        return [_one(address, options)]
     pattern = address if is_pattern else f"{address.rstrip('/')}/*"
     paths = PipelinePaths(address, None, options.allow_network).matching(pattern, "orthos")
     images = [path for path in paths if path.suffix.lower() in RASTERS]
@@ -260,20 +279,25 @@ def _far_files(address: Location, options: SceneOptions) -> list[_Given]:
     return [_Given(path) for path in images]
 
 
-def _of_item(name: Location, options: SceneOptions) -> _Given:
-    image, opened = resolved(name, options)
-    if opened.rpc != options.rpc:
+def _one(name: Location, options: SceneOptions) -> _Given:
+    """Return an image, or that of a STAC item."""
+    if not name.is_item:
+        return _Given(placed_at(name, options))
+    item = read_item(name.document, allow_network=options.allow_network, roots=tuple(options.roots))
+    image = item.image(name.asset)
+    if item.rpc_of(image) is not None:
         raise InputError(
             "the RPC of this image is an asset of its own, and a stack takes the RPC next to the image",
             file=name,
             field="orthos",
             remedy="download the image and the RPC to one folder, with the same stem",
         )
-    return _Given(placed_at(image, options), item=placed_at(name.document, options))
+    named = re.sub(r"[^\w.-]+", "_", item.id).strip(".")
+    return _Given(placed_at(image.href, options), item=placed_at(name.document, options), id=named)
 
 
 def _listed(path: Place, options: SceneOptions) -> list[_Given]:
-    return [_Given(placed_at(file, options), stated) for file, stated in read_list(path)]
+    return [replace(_one(Location(file), options), stated=stated) for file, stated in read_list(path)]
 
 
 @reads("give a CSV file with the columns file and date")
@@ -396,11 +420,17 @@ def time_of(text: str, file: str | os.PathLike[str] | None = None) -> datetime:
     plain = re.sub(r"^(\d{4})[:/](\d\d)[:/](\d\d)", r"\1-\2-\3", text.strip())
     try:
         time = datetime.fromisoformat(plain)
-        return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+        time = time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+        if time.year not in _YEARS:
+            raise ValueError(time.year)
     except (ValueError, OverflowError) as error:
         raise InputError(
-            f"{text[:40]!r} is not a date", file=file, field="date", remedy="write dates as 2024-05-03"
+            f"{text[:40]!r} is not a date from {_YEARS[0]} to {_YEARS[-1]}",
+            file=file,
+            field="date",
+            remedy="write dates as 2024-05-03",
         ) from error
+    return time
 
 
 def by_pattern(name: str, pattern: str) -> datetime:
@@ -416,8 +446,8 @@ def by_pattern(name: str, pattern: str) -> datetime:
     """
     parts = re.split(r"(%[a-zA-Z%])", pattern)
     codes = [part for part in parts if part.startswith("%") and len(part) == 2]
-    unknown = [code for code in codes if code not in _PARTS]
-    if unknown or "%Y" not in codes or len(set(codes)) < len(codes):
+    wrong = [code for code in codes if code not in _PARTS or _WITHIN.get(code, "%Y") not in codes]
+    if wrong or "%Y" not in codes or len(set(codes)) < len(codes):
         raise InputError(
             f"{pattern!r} is not a pattern of a date", field="stack.date_pattern", remedy="such as %Y%m%d or %Y-%j"
         )
@@ -449,11 +479,13 @@ def _time_in(match: re.Match[str]) -> datetime | None:
     """Return the time at a place of a pattern; None if there is no such time."""
     numbers = {key: text for key, text in match.groupdict().items() if key != "whole"}
     try:
-        return datetime.strptime("".join(numbers.values()), "".join(f"%{key}" for key in numbers)).replace(tzinfo=UTC)
+        time = datetime.strptime("".join(numbers.values()), "".join(f"%{key}" for key in numbers)).replace(tzinfo=UTC)
     except ValueError:
         return None
+    # strptime takes day 366 of any year.
+    return time if time.year == int(numbers["Y"]) else None
 
 
 def _is_within(name: str, first: int, last: int) -> bool:
-    """Return whether a digit is directly before or after a part of a name."""
-    return name[first - 1 : first].isdigit() or name[last : last + 1].isdigit()
+    """Return whether a part of a name begins or ends within a number."""
+    return any(name[edge - 1 : edge + 1].isdigit() for edge in (first, last) if 0 < edge < len(name))
