@@ -11,7 +11,9 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
@@ -212,6 +214,15 @@ def test_pairs_whose_names_join_to_the_same_text_keep_their_own_matches(made, tm
     counted.clear()
     run([tmp_path / "in"], tmp_path / "out")
     assert not counted
+
+
+def test_pairs_of_long_names_have_names_that_file_systems_take():
+    names = [f"{'é' * 60}_{number}" for number in range(3)]
+    pairs = {
+        matching._name_of(SimpleNamespace(name=one), SimpleNamespace(name=other)) for one, other in pairwise(names)
+    }
+    assert len(pairs) == 2
+    assert max(len(f"{pair}.record.json".encode()) for pair in pairs) < 256
 
 
 def test_a_changed_ortho_is_matched_again(made, tmp_path, counted):

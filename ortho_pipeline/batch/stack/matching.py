@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +31,8 @@ from ortho_pipeline.stores.objects import Objects
 _BYTES = 100_000_000
 #: What is between the names of two dates.
 _BETWEEN = "__"
+#: Bytes of a name of a pair: file systems allow 255, and files of records end with more.
+_LONGEST = 230
 
 
 class EdgeMatches(Record):
@@ -146,7 +150,9 @@ def _name_of(first: Dated, second: Dated) -> str:
     name = f"{first.name}{_BETWEEN}{second.name}"
     # Another pair may have its names joined to the same text: here the length tells where the first one ends.
     is_ambiguous = name.find(_BETWEEN) != name.rfind(_BETWEEN)
-    return f"{name}{_BETWEEN}{len(first.name)}" if is_ambiguous else name
+    name = f"{name}{_BETWEEN}{len(first.name)}" if is_ambiguous else name
+    encoded = os.fsencode(name)
+    return name if len(encoded) <= _LONGEST else hashlib.sha256(encoded).hexdigest()
 
 
 def _file_of(name: str) -> str:
