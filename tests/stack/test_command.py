@@ -22,7 +22,7 @@ import pytest
 from osgeo import gdal
 from rasters import Rasters
 
-from ortho_pipeline.batch.stack import matching
+from ortho_pipeline.batch.stack import matching, writing
 from ortho_pipeline.batch.stack.command import stack
 from ortho_pipeline.batch.stack.result import summary
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
@@ -322,6 +322,22 @@ def test_a_lock_of_a_run_that_was_killed_after_its_last_rename_goes(made, tmp_pa
     assert list((tmp_path / "out").rglob("*.part"))
     run([made[0][0].parent], tmp_path / "out")
     assert contents(tmp_path / "out") == before
+
+
+def test_documents_go_before_the_orthos_are_made_again(made, tmp_path, monkeypatch):
+    shutil.copytree(made[1], tmp_path / "out")
+    write, written = writing.write_resampled, []
+
+    def killed(*arguments: Any) -> None:
+        if written:
+            raise KeyboardInterrupt
+        written.append(write(*arguments))
+
+    monkeypatch.setattr(writing, "write_resampled", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run([made[0][0].parent], tmp_path / "out", StackOptions(datum=made[0][1].stem))
+    # One ortho is that of the new datum, and the others are those of the old one.
+    assert not {"stack.json", "stack.html"} & set(os.listdir(tmp_path / "out"))
 
 
 def test_corrections_only_keep_the_pixels(made, tmp_path):

@@ -292,13 +292,25 @@ def _made(planned: _Planned, crew: Crew) -> StackResult:
     placed, solved = placed.of_corrected(dates, solved)
     aligned = planned.part(_ALIGNED)
     writer = Writer(aligned, placed, scene, planned.output, options.corrections_only)
-    names, outdated = writer.write(dates, solved, crew, lambda share: told("writing", share))
+    names, outdated = writer.write(
+        dates, solved, crew, lambda share: told("writing", share), lambda: _clear_documents(planned, dates)
+    )
     outputs = {name: f"{_ALIGNED}/{file}" for name, file in names.items()}
     groups = {"stack": options, "match": planned.match, "surface": planned.surface, "output": planned.output}
     record = record_of(dates, placed, pairs, solved, outputs, groups)
     files = _documents(planned, dates, record, outdated)
     said = summary(record, sum(pair.fresh for pair in pairs))
     return StackResult(files, record.to_json(), said, record=record, access=scene.access)
+
+
+def _clear_documents(planned: _Planned, dates: Sequence[Dated]) -> None:
+    """Remove items, record and page of an earlier run on this machine, before the orthos that they describe change."""
+    aligned = planned.part(_ALIGNED)
+    if not aligned.is_far:
+        with together(aligned.place, "items of a stack"):
+            retire(items_of(Path(aligned.place), dates))
+        with together(planned.folder, "stack"):
+            retire(_files_of(Path(planned.folder)).values())
 
 
 def _documents(
@@ -329,10 +341,14 @@ def _documents(
 
 
 def _write_documents(record: StackRecord, folder: Path) -> dict[str, Path]:
-    files = {"json": folder / "stack.json", "html": folder / "stack.html"}
+    files = _files_of(folder)
     write_json(files["json"], record.to_json())
     write_page(record, files["html"])
     return files
+
+
+def _files_of(folder: Path) -> dict[str, Path]:
+    return {"json": folder / "stack.json", "html": folder / "stack.html"}
 
 
 def _retire(store: Objects, names: Sequence[str]) -> None:

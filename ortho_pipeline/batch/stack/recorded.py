@@ -134,13 +134,21 @@ class RecordedFolder:
         if record is not None:
             DIGESTS.learn(record.inputs)
 
-    def make_all(self, crew: Crew, sets: Sequence[FileSet], told: Callable[[float], None]) -> dict[str, Made]:
+    def make_all(
+        self,
+        crew: Crew,
+        sets: Sequence[FileSet],
+        told: Callable[[float], None],
+        begin: Callable[[], None] | None = None,
+    ) -> dict[str, Made]:
         """Make sets of files, unless they are as recorded; return their records by name.
 
         Parameters
         ----------
         told : callable
             Called with the finished share.
+        begin : callable, optional
+            Called before any is made.
 
         Raises
         ------
@@ -168,6 +176,8 @@ class RecordedFolder:
                 note(one.name, Made(kept, True))
         # New processes for nothing take longer than all of this.
         if left:
+            if begin is not None:
+                begin()
             for one, future in completed(crew, self.make, left):
                 note(one.name, future.result())
         return found

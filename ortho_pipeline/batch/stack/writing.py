@@ -63,11 +63,15 @@ class Writer:
     corrections_only: bool
 
     def write(
-        self, dates: Sequence[Dated], solved: AdjustedStack, crew: Crew, told: Callable[[float], None]
-    ) -> tuple[dict[str, str], list[str]]:
-        """Return the names of files of dates, and those of files of earlier runs that are no part of the result."""
+        self, dates: Sequence[Dated], solved: AdjustedStack, crew: Crew, told: Callable[[float], None],
+        begin: Callable[[], None],
+    ) -> tuple[dict[str, str], list[str]]:  # fmt: skip
+        """Return the names of files of dates, and those of files of earlier runs that are no part of the result.
+
+        `begin` is called before the first of them changes.
+        """
         sets = [self._set(one, solved, number) for number, one in enumerate(dates) if solved.determined[number]]
-        self.folder.make_all(crew, sets, told)
+        self.folder.make_all(crew, sets, told, begin)
         return {one.name: next(iter(one.files.values())) for one in sets}, self._outdated(sets)
 
     def _outdated(self, sets: Sequence[FileSet]) -> list[str]:
