@@ -90,6 +90,8 @@ COUNT ?= 300
 mutants: setup
 	@$(BIN)/python tools/mutants.py --record
 	$(BIN)/python tools/mutants.py --seed $(SEED) --count $(COUNT)
+	@$(BIN)/python tools/mutants.py --record $(addprefix tests/,attack batch cli measure storage studies)
+	$(BIN)/python tools/mutants.py --seed $(SEED) --count $(COUNT) --again --limit 240
 
 # The packages of a resolution of uv, in an environment of their own.
 RESOLUTION ?= lowest-direct

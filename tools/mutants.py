@@ -5,7 +5,8 @@ Then the tests that enter the changed function run, those of its module and room
 them are used. An error is caught if one of them fails or takes too long.
 
 `--record` finds which test enters which function (`tools/entered.py`), again for files of tests that have changed.
-Tests of texts, servers and whole programs are left out, unless they are named.
+Tests of texts, servers and whole programs are left out, unless they are named. `make mutants` names them for the errors
+that are left (`--again`), with a longer limit.
 The records and results are kept in `--folder`, so that a run can be stopped and continued. `--report` prints the share
 that was caught.
 """
