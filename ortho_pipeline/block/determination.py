@@ -38,8 +38,14 @@ def naming_wrong_points(problem: BlockProblem, start: State, selection: Selectio
         yield
     except (DegeneratePoints, NotConverged) as error:
         points = problem.points
-        missed = np.hypot(*(points.measured - predict(problem.frame, start.models, points, start.local)).T)
-        missed[~(selection.rays & np.isfinite(missed))] = 0.0
+        misses = points.measured - predict(problem.frame, start.models, points, start.local)
+        misses[~(selection.rays & np.isfinite(misses).all(axis=1))] = 0.0
+        known = selection.ground[points.point] & misses.any(axis=1)
+        for image in np.unique(points.image[known]):
+            # What all known ground of an image has in common is an error of its start.
+            of = known & (points.image == image)
+            misses[of] -= np.median(misses[of], axis=0)
+        missed = np.hypot(*misses.T)
         worst = np.zeros(len(points))
         np.maximum.at(worst, points.point, np.where(missed > _SURE * points.sigma_image, missed, 0.0))
         median = float(np.median(worst[np.unique(points.point)]))
@@ -51,7 +57,9 @@ def naming_wrong_points(problem: BlockProblem, start: State, selection: Selectio
             Text(error.message, f". Wrong points can be the cause: before the adjustment, rays miss most at {each}"),
             file=error.file,
             field=error.field,
-            remedy=Text("check these points first, and delete wrong ones; or ", error.remedy or ""),
+            remedy=Text(
+                "check these points first, and delete wrong ones", *(("; or ", error.remedy) if error.remedy else ())
+            ),
         ) from error
 
 

@@ -22,7 +22,7 @@ from ortho_pipeline.block.determination import (
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
 from ortho_pipeline.block.equations.unknowns import Columns
-from ortho_pipeline.errors import DegeneratePoints, TooFewPoints
+from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.models import ImageCorrection
 
 Prepared = tuple[BlockProblem, State, Selection]
@@ -256,3 +256,18 @@ def test_errors_of_the_first_solution_name_points_that_miss_at_the_start(prepare
     assert named == list(points.ids[:wrong])
     remedy = "check these points first, and delete wrong ones; or give more points" if wrong else "give more points"
     assert str(error.value.remedy) == remedy
+
+
+def test_an_error_of_the_start_that_known_ground_shares_is_no_wrong_point(prepared: Prepared) -> None:
+    """A vendor's model is wrong by many pixels, and only control points show it: they were called wrong."""
+    problem, state, selection = prepared
+    points, known = problem.points, np.arange(len(problem.points)) < 5
+    measured = points.measured + 300.0 * known[points.point, None]
+    measured[np.flatnonzero(points.point == 0)[0]] += 400.0
+    apart = replace(problem, points=replace(points, measured=measured))
+    for ground, named in ((known, points.ids[:1]), (~known, points.ids[:5])):
+        with pytest.raises(NotConverged) as error, naming_wrong_points(apart, state, replace(selection, ground=ground)):
+            raise NotConverged("no inverse")
+        assert [name for name in points.ids if f"{name} (" in str(error.value.message)] == list(named)
+        # An error without a remedy gets no second one that is empty.
+        assert error.value.remedy == "check these points first, and delete wrong ones"
