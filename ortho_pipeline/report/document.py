@@ -31,6 +31,7 @@ from ortho_pipeline.files.json.records import DocumentError
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 from ortho_pipeline.geodesy.distortion import map_from_enu, metres_of_steps
+from ortho_pipeline.geodesy.ellipsoid import longitudes_near
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.points.control_hull import control_hull
@@ -175,6 +176,8 @@ def patterns(covariance: Covariances) -> list[Notice]:
 def _scene(scene: Scene, seen: Mapping[str, Any], model: SensorModel) -> SceneRecord:
     middle = model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), model.reference_height)
     lon_lat = ground_transform(model.crs, "EPSG:4979")(middle)[0, :2]
+    # A model near the antimeridian counts on beyond 180 degrees.
+    lon_lat[0] = longitudes_near(lon_lat[0], 0.0)
     known = {
         "middle_lon_lat": lon_lat.tolist() if np.isfinite(lon_lat).all() else None,
         "name": Path(scene.path).name,

@@ -10,6 +10,8 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -125,6 +127,16 @@ def test_the_place_of_a_fit_is_the_middle_of_the_image():
     said = said.replaced(ortho=None, adjustment=said.adjustment.replaced(points=in_corner))
     middle = CAMERA.image_to_ground(np.array([said.scene.size]) / 2, CAMERA.reference_height)
     np.testing.assert_allclose(place_of(said), middle[0, :2], atol=2e-4)
+
+
+def test_the_place_of_a_fit_beyond_the_antimeridian_is_on_the_map():
+    """An RPC near it counts on: the page said 181° E, and its mark was off the map."""
+    model: Any = SimpleNamespace(
+        crs="EPSG:4979", reference_height=5.0, image_to_ground=lambda image, height: np.array([[181.0, -17.0, height]])
+    )
+    scene: Any = SimpleNamespace(path="a.tif", width=9, height=9, sensor="rpc", model_source="a", facts={})
+    seen = dict.fromkeys(("ground_pixel_m", "lean_m_per_m", "lean_azimuth_deg"))
+    assert report._scene(scene, seen, model).middle_lon_lat == (-179.0, -17.0)
 
 
 def test_locator_finds_land_where_there_is_land():
