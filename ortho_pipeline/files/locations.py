@@ -57,7 +57,7 @@ def check_path(path: str | os.PathLike[str]) -> str:
     import difflib
 
     place = Path(path)
-    if any(mark in str(place) for mark in "*?["):
+    if any(mark in str(place) for mark in "*?"):  # brackets are in names of files, too
         return "list the files, or write the pattern without quotes, so that the shell expands it"
     if not place.parent.is_dir():
         return f"check the path: there is no folder '{place.parent}'"

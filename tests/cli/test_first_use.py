@@ -199,6 +199,14 @@ def test_a_pattern_in_quotes_is_called_one(tmp_path):
     assert "write the pattern without quotes" in done.stderr
 
 
+def test_brackets_in_the_name_of_a_folder_make_no_pattern(tmp_path):
+    (tmp_path / "area [2]").mkdir()
+    (tmp_path / "area [2]" / "scene.tif").touch()
+    assert (
+        f"did you mean '{tmp_path / 'area [2]' / 'scene.tif'}'?" in run("info", tmp_path / "area [2]/scen.tif").stderr
+    )
+
+
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     assert "there is no folder" in run("info", tmp_path / "none" / "scene.tif").stderr
 
