@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import Lock, allowed, open_itself, parse_json, sync_folder
 
 #: A larger file (bytes) is not a journal of manual measurements.
@@ -98,11 +97,7 @@ class Journal:
         raise InputError(
             "the journal was moved, deleted or replaced, so this action is not saved",
             file=self.path,
-            remedy=Text(
-                "move it back; or save, close this process, and start again with the saved points as ",
-                Setting("points.gcps"),
-                " and another output",
-            ),
+            remedy="move it back; or save, close this process, and begin another output with the saved points",
         )
 
     def more(self) -> list[dict[str, Any]]:

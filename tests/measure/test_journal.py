@@ -67,6 +67,7 @@ def test_a_journal_that_was_moved_takes_no_action_until_it_is_back(written: Path
     with pytest.raises(InputError, match="moved, deleted or replaced") as caught:
         journal.append(put("lost"))
     assert caught.value.file == str(written)
+    assert "`" not in caught.value.remedy, "the page shows it, and knows no flags"
     aside.replace(written)
     journal.append(put("kept"))
     journal.close()
