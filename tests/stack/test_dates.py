@@ -147,6 +147,16 @@ def test_an_ortho_without_a_date_is_an_error(tmp_path):
         dated_orthos([tmp_path])
 
 
+def test_the_remedy_for_an_unknown_time_in_metadata_is_a_list_or_a_pattern(tmp_path):
+    """Nobody writes dates into the metadata of an archive."""
+    ortho(tmp_path / "a.tif", ACQUISITIONDATETIME="0001-01-01T00:00:00Z")
+    ortho(tmp_path / "b.tif", ACQUISITIONDATETIME="2022-05-03")
+    with pytest.raises(InputError, match="not a date from 1900") as error:
+        dated_orthos([tmp_path])
+    assert "CSV file" in str(error.value.remedy)
+    assert "stack.date_pattern=%Y%m%d" in str(error.value.remedy)
+
+
 @pytest.mark.parametrize(
     ("name", "pattern", "day"),
     [

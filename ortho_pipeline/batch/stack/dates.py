@@ -53,6 +53,12 @@ _PARTS = {"%Y": r"(?P<Y>\d{4})", "%m": r"(?P<m>\d{2})", "%d": r"(?P<d>\d{2})", "
 _WITHIN = {"%d": "%m", "%M": "%H", "%S": "%M"}
 #: Numbers in names that are years of other times are no dates, nor are times that programs write for unknown ones.
 _YEARS = range(1900, 2101)
+#: Where dates can be from if those next to an image or in it are missing or wrong.
+_OTHERWISE = Text(
+    "instead of the folder, give a CSV file with the columns file and date (2024-01-31); or the place of the date in "
+    "the file names: ",
+    Setting("stack.date_pattern", "%Y%m%d"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,24 +359,20 @@ def _date(
     for document, name in documents:
         text = _stated_in(document)
         if text is not None:
-            return time_of(text, path), name
+            return time_of(text, path, _OTHERWISE), name
     acquired = scene.facts.get("acquired")
     if scene.sensor != ORTHO and isinstance(acquired, str):
-        return time_of(acquired, path), "metadata"
+        return time_of(acquired, path, _OTHERWISE), "metadata"
     for domain, item in _ITEMS:
         text = (dataset.GetMetadata(domain) or {}).get(item)
         if text:
-            return time_of(text, path), item
+            return time_of(text, path, _OTHERWISE), item
     raise InputError(
         "this image has no date: no STAC item and no report are next to it, and its metadata state none"
         + (" (TIFFTAG_DATETIME may be when the file was written)" if dataset.GetMetadataItem(_WRITTEN) else ""),
         file=path,
         field="date",
-        remedy=Text(
-            "instead of the folder, give a CSV file with the columns file and date (2024-01-31); or the place of the "
-            "date in the file names: ",
-            Setting("stack.date_pattern", "%Y%m%d"),
-        ),
+        remedy=_OTHERWISE,
     )
 
 
@@ -406,7 +408,9 @@ def _facts_of(document: Any) -> dict[str, Any]:
     return found
 
 
-def time_of(text: str, file: str | os.PathLike[str] | None = None) -> datetime:
+def time_of(
+    text: str, file: str | os.PathLike[str] | None = None, remedy: str = "write dates as 2024-05-03"
+) -> datetime:
     """Return a date or time as texts and metadata write it; UTC if they do not say otherwise.
 
     >>> time_of("2024:05:03 10:12:00").isoformat()
@@ -428,7 +432,7 @@ def time_of(text: str, file: str | os.PathLike[str] | None = None) -> datetime:
             f"{text[:40]!r} is not a date from {_YEARS[0]} to {_YEARS[-1]}",
             file=file,
             field="date",
-            remedy="write dates as 2024-05-03",
+            remedy=remedy,
         ) from error
     return time
 
