@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from skimage.registration import phase_cross_correlation
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.block_results import orthos as orthos_of_blocks
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.hookspecs import Scene
@@ -128,6 +130,18 @@ def test_with_masks_the_other_images_get_orthos(tmp_path: Path) -> None:
     for refused in (lambda: plan("error"), lambda: plan("mask", {"far": scenes["far"]})):
         with pytest.raises(CoverageError, match="image far: "):
             refused()
+
+
+def test_heights_beyond_a_model_are_an_error_with_masks_too(sample: Path, tmp_path: Path) -> None:
+    """The DEM covers both images; the notice said that it does not cover one."""
+    near = open_scene(sample / "scene.tif")
+    rpc: Any = near.model
+    scenes = {"low": replace(near, models={"rpc": replace(rpc, h_off=rpc.h_off - 3000.0)}), "near": near}
+    files = {name: {"ortho": tmp_path / name} for name in scenes}
+    asked = SceneOptions(), SurfaceOptions(dem=sample / "dem.tif", fill="mask"), OutputOptions()
+    fit: Any = SimpleNamespace(heights=None)
+    with pytest.raises(CoverageError, match="image low: heights under the scene are"):
+        orthos_of_blocks.OrthoPlan.of(scenes, files, fit, None, asked)
 
 
 def test_options_of_orthos_need_orthos(sample: Path, tmp_path: Path) -> None:

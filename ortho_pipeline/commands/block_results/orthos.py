@@ -77,9 +77,9 @@ class OrthoPlan:
         ground = corrected(heights or open_surface(surface, options, under=scenes.values()), fit)
         outside = []
         if isinstance(ground, DemSurface) and ground.fill == "mask":
-            outside = [
-                name for name, one in scenes.items() if not lay(one.model, ground, one.width, one.height).coverage
-            ]
+            laid = {name: lay(one.model, ground, one.width, one.height) for name, one in scenes.items()}
+            # Heights beyond those of a model are a fault, as of their datum: `on_one_grid` refuses them.
+            outside = [name for name, one in laid.items() if not (one.coverage or one.beyond)]
         if len(outside) == len(scenes):
             outside = []  # `on_one_grid` refuses them all
         text = "the DEM does not cover this image, so it has no ortho"
