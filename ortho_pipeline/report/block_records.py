@@ -58,7 +58,10 @@ class BlockHeadline(Record):
 
 
 class AbsoluteAccuracy(Record):
-    """Standard deviations on the ground, metres: medians over the points, with the errors of the datum."""
+    """Standard deviations on the ground, metres: medians over the points, with the errors of the datum.
+
+    Control points count only where there are no others.
+    """
 
     east_m: float
     north_m: float
