@@ -110,7 +110,7 @@ def test_assets_of_one_name_have_the_ids_of_their_items(tmp_path):
     assert [one.name for one in found] == [*names[1:], names[0]]
     with pytest.raises(InputError, match="two images are called B04") as caught:
         dated_orthos([tmp_path / "*" / "B04.tif"])
-    assert "STAC item" in str(caught.value.remedy)
+    assert "STAC item of each, with an id of its own" in str(caught.value.remedy)
 
 
 def test_an_image_with_two_dates_in_lists_is_refused(tmp_path):

@@ -234,7 +234,7 @@ def _each_once(given: Iterable[_Given]) -> list[_Given]:
                 f"two images are called {one.name}",
                 file=one.path,
                 field="orthos",
-                remedy="rename one of them, or give a STAC item of each",
+                remedy="rename one of them, or give a STAC item of each, with an id of its own",
             )
         names.add(key_of_name(one.name))
     return list(found.values())
