@@ -226,3 +226,12 @@ def test_an_input_that_changes_during_the_run_is_an_error(shifted, tmp_path, mon
     assert done.exit_code == 2
     assert f"{paths[which]}: this file changed during the run" in done.output
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("ortho", ["https://example.com/a.tif", "/vsizip/a.zip/a.tif"])
+def test_a_moved_grid_needs_an_ortho_on_this_machine(ortho, tmp_path):
+    """A VRT that names a file elsewhere is refused when it is read; the remedy named a temporary file."""
+    done = run("align", ortho, "--reference", "b.tif", "-o", tmp_path / "out", "--no-resample", "--allow-network")
+    assert done.exit_code == 2
+    assert "needs an ortho that is a file on this machine" in done.output
+    assert "copy the ortho to this machine, or resample it" in done.output

@@ -28,6 +28,7 @@ from ortho_pipeline.estimation.statistics import chance_of_mean
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
 from ortho_pipeline.files import retire, staged, states, together, write_json
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.matching.matcher import held_out
 from ortho_pipeline.models import ImageCorrection, MapGrid, SensorModel, SmoothField
@@ -101,7 +102,7 @@ def align(
     >>> done.document["correction"]["kind"]
     'shift'
     """
-    _refuse_unusable(match, bending)
+    _refuse_unusable(Location(ortho), match, bending, resample)
     output = OutputOptions(resampling="cubic") if output is None else output
     hidden = [ClassMask.parse(text) for text in masks]
     request = Request(ortho, scene, match=match, output=output)
@@ -147,7 +148,7 @@ def align(
     return Result(files, document, summary_text(document))
 
 
-def _refuse_unusable(match: MatchOptions, bending: float) -> None:
+def _refuse_unusable(ortho: Location, match: MatchOptions, bending: float, resample: bool) -> None:
     if not match.reference:
         raise InputError(
             "no reference to align the ortho with",
@@ -159,6 +160,13 @@ def _refuse_unusable(match: MatchOptions, bending: float) -> None:
             f"the bending must be above 0 and at most 0.2 px per pixel, not {bending:g}",
             field="bending",
             remedy="give 0.02",
+        )
+    if not resample and (ortho.is_far or ortho.in_archive):
+        raise InputError(
+            "a new map grid without resampling needs an ortho that is a file on this machine",
+            file=ortho,
+            field="resample",
+            remedy="copy the ortho to this machine, or resample it",
         )
 
 
