@@ -411,7 +411,8 @@ def test_what_is_said_of_heights() -> None:
     spots = SpotsRecord(used=3, left_out=("s1", "s2"), without=0, mean_m=0.0, rms_m=0.1)
     (left,) = record(spots=spots).notices()
     assert (left.code, left.fields["count"], left.fields["points"]) == ("spot-heights-left-out", 2, ["s1", "s2"])
-    for source, code in (("assumed", "by-default"), ("estimated", "estimated"), ("enlarged", "enlarged")):
+    for source in ("assumed", "estimated", "enlarged", "contradicted"):
+        code = "by-default" if source == "assumed" else source
         (notice,) = record(sigma_is=source).notices()
         assert notice.code == f"dem-sigma-{code}"
         assert notice.fields["dem_sigma_m"] == 2.0

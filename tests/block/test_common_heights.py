@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from chains import Chain, dem, dense, fly, with_control
 
-from ortho_pipeline.block.adjustment import _prepared
+from ortho_pipeline.block.adjustment import _prepared, adjust
 from ortho_pipeline.block.equations.problem import Selection
 from ortho_pipeline.block.equations.solver import Solved, attempt
 from ortho_pipeline.block.heights.record import record_of
@@ -100,6 +100,18 @@ def test_the_record_counts_every_tie_once(settled: tuple[Solved, Selection, Heig
     assert found.shift_sigma_m == pytest.approx((6.0, 6.0))
     larger = record_of(replace(heights, scale=2.0), solved)
     assert (larger.sigma_m, larger.sigma_is) == (pytest.approx(3.0), "enlarged")
+
+
+@pytest.mark.parametrize(("stated", "says"), [(3.0, "contradicted"), (8.0, "stated")])
+def test_a_sigma_of_correlated_errors_that_ties_contradict_is_named(stated: float, says: str, tmp_path: Path) -> None:
+    """It is not enlarged, so the figures of the report are too small."""
+    block = fly(Chain(images=3, ties=90, errors=5.0, normal=True), 1)
+    surface = dem(block, tmp_path / "dem.tif", 1, correlated=9.0, length=100.0).with_sigma(stated)
+    heights = DemHeights(surface, bias=0.0, shift=0.0, correlation=100.0)
+    found = adjust(block.start, block.points, heights=heights, hold=5.0).heights
+    assert found is not None
+    assert (found.sigma_is, found.sigma_m) == (says, stated)
+    assert [one.code for one in found.notices()] == ["dem-sigma-contradicted"] * (says == "contradicted")
 
 
 def test_residuals_of_heights_vary_as_in_a_dense_problem(settled: tuple[Solved, Selection, Heights]) -> None:

@@ -101,6 +101,21 @@ class CommonHeights(CommonGroundError):
         return float(chdtrc(2, alone @ told @ alone))
 
     @property
+    def chance_of_correlated(self) -> float:
+        """Probability of correlated errors as large as the estimates, if their stated sigma is right.
+
+        The estimates have the covariance K = I - `left` then; their sum of squares has the mean tr K and the variance
+        2 |K|². The chi-squared distribution with these is that of Satterthwaite 1946.
+        """
+        from scipy.special import chdtrc
+
+        gain = (np.eye(len(self.value)) - self.left)[3:, 3:]
+        mean, square = float(np.trace(gain)), float((gain**2).sum())
+        if mean < _TOLD:
+            return 1.0
+        return float(chdtrc(mean**2 / square, (self.value[3:] ** 2).sum() * mean / square))
+
+    @property
     def of_points(self) -> Array:
         """Its part ``(N, 3, 3)`` of the covariance of the ground, m²."""
         return np.asarray(self.by_points @ self.left @ self.by_points.swapaxes(1, 2))

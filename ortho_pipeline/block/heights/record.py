@@ -18,7 +18,7 @@ from ortho_pipeline.files.json.records import Count, Pair, Record
 if TYPE_CHECKING:
     from ortho_pipeline.block.heights.settling import Heights
 
-#: A shift of the DEM is significant if one as large by chance is less probable than this.
+#: A shift and correlated errors of the DEM are significant if such large ones are less probable than this by chance.
 _SIGNIFICANT = 0.001
 #: A notice names so many points.
 _NAMED = 10
@@ -30,8 +30,8 @@ class HeightsRecord(Record):
     The heights of `left_out` contradict their ties. At breaks the DEM is no plane, `on_water` it is flattened; ties
     `without` a height are in voids or outside the DEM. Shifts are east and north; `shift_chance` is the probability of
     one as large without a shift. A prior is the standard deviation before the adjustment. A stated sigma is enlarged if
-    the residuals are significantly larger. `mean_error_m` is the mean of the shared errors at the ties, without a shift
-    that was applied.
+    the residuals are significantly larger; that of correlated errors is contradicted, and stays. `mean_error_m` is the
+    mean of the shared errors at the ties, without a shift that was applied.
     """
 
     used: Count
@@ -39,7 +39,7 @@ class HeightsRecord(Record):
     at_breaks: Count
     without: Count
     sigma_m: float
-    sigma_is: Literal["stated", "enlarged", "estimated", "assumed"]
+    sigma_is: Literal["stated", "enlarged", "estimated", "assumed", "contradicted"]
     rms_m: float | None
     mean_error_m: float
     bias_m: float
@@ -78,6 +78,14 @@ class HeightsRecord(Record):
                 f"estimated from {counted(self.used, 'height')}. Roofs and trees cause this"
             )
             found.append(Notice("dem-sigma-enlarged", text, dem_sigma_m=self.sigma_m, count=self.used))
+        elif self.sigma_is == "contradicted":
+            text = Text(
+                f"DEM and ties differ more than a DEM accuracy of {metres(self.sigma_m)} allows. It was used as it is, "
+                "because its errors count as correlated (",
+                Setting("points.dem_correlation"),
+                "), so all sigmas are too small. Roofs and trees cause this, too",
+            )
+            found.append(Notice("dem-sigma-contradicted", text, dem_sigma_m=self.sigma_m, count=self.used))
         if self.left_out:
             number, named = len(self.left_out), self.left_out[:_NAMED]
             left_out = (
@@ -128,7 +136,8 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         on_water=int(water.sum()),
         without=int((active & heights.of & ~wrong & ~broken & ~water).sum()) - len(used),
         sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else heights.sigma,
-        sigma_is=heights.sigma_is,
+        # Those of correlated errors are not enlarged: roofs would count as errors of the DEM over long distances.
+        sigma_is="contradicted" if heights.common.chance_of_correlated < _SIGNIFICANT else heights.sigma_is,
         rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
         mean_error_m=float(known_errors(heights)[used].mean()) if len(used) else 0.0,
         bias_m=bias,

@@ -75,6 +75,7 @@ _LOOK: dict[str, str] = {
         Setting("points.dem_correlation"),
         ".",
     ),
+    "dem-sigma-contradicted": Text("State a larger accuracy with ", Setting("surface.sigma"), "."),
     "weak-join": Text(
         "Give control points, another view of the place, or a DEM (",
         Setting("surface.dem"),
