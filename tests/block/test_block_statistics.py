@@ -318,7 +318,7 @@ def replace_chance(record: Any, chance: float | None) -> Any:
 def heights_of(stated: np.ndarray | None = None, **more: Any) -> Heights:
     none: Any = None
     numbers = {"sigma": 10.0, "own": np.ones(60), "common": none, "wrong": none, "broken": none, **more}
-    return Heights(none, np.ones(60, dtype=bool), none, none, stated, **numbers)
+    return Heights(SimpleNamespace(correlation=None), np.ones(60, dtype=bool), none, none, stated, **numbers)
 
 
 def test_a_sigma_is_estimated_from_fifty_heights_that_show_their_errors() -> None:

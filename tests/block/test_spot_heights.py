@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from chains import CRS, Block, Chain, apart, dem, fly, neighbours, spots_of
+from chains import CRS, Block, Chain, apart, dem, fly, neighbours, spots_of, with_control
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.heights.source import DemHeights
@@ -74,6 +75,34 @@ def test_spots_off_the_dem_are_refused(tmp_path: Path) -> None:
     spots = SpotHeights(np.array([(10.0, 50.0, 100.0)]), np.array([0.3]), np.zeros(1), ("a",))
     with pytest.raises(InputError, match="no height at any spot height"):
         adjust(block.start, block.points, heights=DemHeights(dem(block, tmp_path / "dem.tif", 0), spots=spots))
+
+
+@pytest.mark.parametrize(("control", "used"), [(False, 6), (True, 0)])
+def test_spots_of_another_height_datum_are_named(tmp_path: Path, control: bool, used: int) -> None:
+    """They move the DEM by the geoid; control points show that they are wrong, and all are left out."""
+    block = fly(Chain(images=2, ties=60, convergence_deg=10.0), 0)
+    spots = spots_of(block, 0.1, 0.3, np.random.default_rng(1))
+    points = with_control(block) if control else block.points
+    for off, codes in ((0.0, []), (30.0, ["heights-disagree"])):
+        surface = dem(block, tmp_path / f"{off}.tif", 0, white=2.0).with_sigma(2.0)
+        moved = replace(spots, ground=spots.ground + np.array([0.0, 0.0, off]))
+        fit = adjust(block.start, points, heights=DemHeights(surface, spots=moved))
+        assert fit.heights is not None
+        assert fit.heights.spots is not None
+        assert fit.heights.spots.used == (used if off else 6)
+        (notice,) = [one for one in fit.warnings if one.code.startswith(("heights-d", "spot"))] or [None]
+        assert ([] if notice is None else [notice.code]) == codes
+    assert notice is not None
+    assert notice.fields["median_m"] == pytest.approx(30.0, abs=3.0)
+    assert "below the spot heights" in str(notice)
+
+
+def test_spots_much_farther_off_than_a_datum_are_refused(tmp_path: Path) -> None:
+    block = fly(Chain(images=2, ties=40), 0)
+    spots = spots_of(block, 0.1, 0.3, np.random.default_rng(1))
+    far = replace(spots, ground=spots.ground + np.array([0.0, 0.0, 5000.0]))
+    with pytest.raises(InputError, match=r"the spot heights are \d+\.\d m above the DEM"):
+        adjust(block.start, block.points, heights=DemHeights(dem(block, tmp_path / "dem.tif", 0), spots=far))
 
 
 @pytest.mark.slow

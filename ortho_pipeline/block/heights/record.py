@@ -9,6 +9,7 @@ import numpy as np
 
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.heights.adjusted_dem import known_errors
+from ortho_pipeline.block.heights.source import FREE_BIAS
 from ortho_pipeline.block.heights.spots import SpotsRecord
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 #: A shift and correlated errors of the DEM are significant if such large ones are less probable than this by chance.
 _SIGNIFICANT = 0.001
+#: Heights have different datums if they differ by more than this (m), and by more than so many sigmas; so many spot
+#: heights that contradict all others show it, too.
+_DATUMS, _ALLOWED, _ENOUGH = 20.0, 4.0, 3
 #: A notice names so many points.
 _NAMED = 10
 
@@ -106,12 +110,38 @@ class HeightsRecord(Record):
             text = Text(f"{apart} ({chance}). {doubt}. Estimated shift of the DEM: {part}. ", *remedy)
             fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
             found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
-        if self.spots is not None and self.spots.left_out:
-            number, named = len(self.spots.left_out), self.spots.left_out[:_NAMED]
+        return [*found, *self._of_known_heights()]
+
+    def _of_known_heights(self) -> list[Notice]:
+        """Return notices of a DEM of another height datum, and of spot heights that were left out."""
+        datums, spots = self._between_datums(), self.spots
+        found = [] if datums is None else [datums]
+        if spots is not None and spots.left_out and (spots.used or datums is None):
+            number, named = len(spots.left_out), spots.left_out[:_NAMED]
             who = counted(number, "spot height contradicts", "spot heights contradict")
             left_out = f"{who} the DEM and the other spot heights; not used: {', '.join(named)}"
             found.append(Notice("spot-heights-left-out", left_out, count=number, points=list(named)))
         return found
+
+    def _between_datums(self) -> Notice | None:
+        """Return a notice if spot heights, or the block, are farther from the DEM than its accuracy allows."""
+        difference, spots = self.bias_m, self.spots
+        if spots is not None and not spots.used and len(spots.left_out) >= _ENOUGH and spots.mean_m is not None:
+            difference = spots.mean_m - self.bias_m
+        elif spots is not None and not spots.used:
+            spots = None
+        free = self.spots is not None and self.bias_prior_m == FREE_BIAS
+        allowed = self.sigma_m if free else max(self.sigma_m, self.bias_prior_m)
+        if abs(difference) < max(_DATUMS, _ALLOWED * math.hypot(allowed, self.bias_sigma_m)):
+            return None
+        side, what = "above" if difference > 0 else "below", "block" if spots is None else "spot heights"
+        text = (
+            f"the DEM is {metres(abs(difference))} {side} the {what}, although its accuracy is {metres(allowed)}: "
+            "their heights probably have different datums"
+        )
+        remedy = () if spots is None else (" (", Setting("points.spot_vertical"), ")")
+        fields = {"median_m": -difference, "spread_m": self.bias_sigma_m, "moved_m": None}
+        return Notice("heights-disagree", Text(text, *remedy), **fields)
 
 
 def record_of(heights: Heights, solved: Solved) -> HeightsRecord:

@@ -17,7 +17,7 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
-from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
+from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, FREE_BIAS, DemHeights
 from ortho_pipeline.block.heights.spots import NORMAL, SpotDifferences
 from ortho_pipeline.block.heights.terrain import LocalTerrain
 from ortho_pipeline.block.points import Index
@@ -45,8 +45,6 @@ _MOVED = 0.25
 _ENOUGH, _REDUNDANT = 50, 0.2
 #: Stated sigmas count as too small if residuals are larger by so many standard deviations of their mean square.
 _SIGNIFICANT = 2.5
-#: Standard deviation (m) before the adjustment of a bias that spot heights fix.
-_FREE = 100.0
 _REMEDY = Text("give control points or a better DEM, or ", Setting("points.dem_heights", "off"))
 
 
@@ -111,7 +109,7 @@ class Heights:
         each = np.full(len(rows), DEFAULT_SIGMA) if stated is None else stated
         typical = float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else DEFAULT_SIGMA
         spots = SpotDifferences.of(source, DEFAULT_SIGMA)
-        bias = (typical if spots is None else _FREE) if source.bias is None else source.bias
+        bias = (typical if spots is None else FREE_BIAS) if source.bias is None else source.bias
         own = np.ones(count)
         own[rows] = source.sharing(ground[rows])
         loads = np.zeros((count, 3))

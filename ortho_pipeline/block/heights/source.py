@@ -23,6 +23,8 @@ from ortho_pipeline.surface.dem import DemSurface
 
 #: Sigma (m) of a DEM without a stated accuracy; matching assumes the same.
 DEFAULT_SIGMA = 10.0
+#: Standard deviation (m) before the adjustment of a bias that spot heights fix.
+FREE_BIAS = 100.0
 #: Times that a ray is followed to the height of the DEM below it, and a change (m) that ends this. Terrain is less
 #: steep than the ray.
 _FOLLOWED, _NEAR_ENOUGH = 6, 1.0

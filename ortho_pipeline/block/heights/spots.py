@@ -14,13 +14,17 @@ import numpy as np
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
+from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points.heights.spot_heights import SpotHeights
 
 #: A spot with a larger difference, in sigmas, is left out.
 _WRONG = 4.0
+#: Spots that are farther (m) from the DEM have no other height datum: geoids are at most 107 m off the ellipsoid.
+_FARTHEST = 200.0
 #: The sigma of a normal distribution over its median absolute value.
 NORMAL = 1.4826
 
@@ -69,7 +73,7 @@ class SpotDifferences:
         Raises
         ------
         InputError
-            If none of them has a height of the DEM.
+            If none of them has a height of the DEM, or that is much farther off than a height datum can be.
         """
         if source.spots is None:
             return None
@@ -95,7 +99,14 @@ class SpotDifferences:
             np.zeros(len(ground), dtype=bool),
         )
         spread = np.sqrt(found.variances(sigma, shared=False))
-        middle = np.median(apart[known])
+        middle = float(np.median(apart[known]))
+        if abs(middle) > _FARTHEST:
+            raise InputError(
+                f"the spot heights are {metres(abs(middle))} {'below' if middle > 0 else 'above'} the DEM (median)",
+                file=source.spots.source or None,
+                field="points.spot_heights",
+                remedy=Text("check their unit (metres), CRS and height datum (", Setting("points.spot_vertical"), ")"),
+            )
         typical = np.maximum(spread, NORMAL * np.median(np.abs(apart[known] - middle)))
         with np.errstate(invalid="ignore"):
             return replace(found, wrong=np.abs(apart - middle) > _WRONG * typical)
@@ -165,13 +176,13 @@ class SpotDifferences:
     def record(self, common: CommonHeights) -> SpotsRecord:
         """Return the published record."""
         used = self.used
-        left = self.residuals(common)[used]
+        left, known = self.residuals(common)[used], used if used.any() else np.isfinite(self.apart)
         wrong = np.flatnonzero(self.wrong)
         return SpotsRecord(
             used=int(used.sum()),
             left_out=tuple(self.spots.ids[k] for k in wrong),
             without=int((~np.isfinite(self.apart)).sum()),
-            mean_m=float(self.apart[used].mean()) if used.any() else None,
+            mean_m=float(self.apart[known].mean()) if known.any() else None,
             rms_m=float(np.sqrt((left**2).mean())) if used.any() else None,
         )
 
@@ -179,7 +190,8 @@ class SpotDifferences:
 class SpotsRecord(Record):
     """Spot heights that fixed the bias of a DEM: their number, the mean of DEM minus spot, and the RMS that is left, m.
 
-    Those in `left_out` contradict the others; `without` counts those where the DEM has no height.
+    The mean is that of all if none is used. Those in `left_out` contradict the others; `without` counts those where the
+    DEM has no height.
     """
 
     used: Count
