@@ -90,7 +90,22 @@ class Surface(abc.ABC):
         """
 
     def with_sigma(self, sigma: float | Surface | None) -> Self:
-        """Return this surface with another standard deviation of its heights."""
+        """Return this surface with another standard deviation of its heights.
+
+        Raises
+        ------
+        InputError
+            If that is a number that is not positive and finite.
+        """
+        if sigma is not None and not isinstance(sigma, Surface):
+            number = number_of(sigma)
+            if not number > 0:
+                raise InputError(
+                    f"{sigma} is not a standard deviation of heights",
+                    field="surface.sigma",
+                    remedy="give a positive number of metres, a surface, or None",
+                )
+            sigma = number
         return dataclasses.replace(self, sigma=sigma)  # type: ignore[type-var]
 
     @abc.abstractmethod

@@ -70,6 +70,15 @@ def test_sigmas_that_are_too_small_are_enlarged_at_the_spots_too(tmp_path: Path)
     assert abs(stated.bias_m - 12.0) < 4 * stated.bias_sigma_m
 
 
+@pytest.mark.parametrize(
+    ("sigma", "plan"),
+    [(0.0, 0.0), (-1.0, 0.0), (np.nan, 0.0), (np.inf, 0.0), (0.3, -1.0), (0.3, np.nan), (0.3, np.inf)],
+)
+def test_sigmas_that_are_none_are_refused(sigma: float, plan: float) -> None:
+    with pytest.raises(InputError, match="spot height b has the standard deviation"):
+        SpotHeights(np.zeros((2, 3)), np.array([0.3, sigma]), np.array([0.0, plan]), ("a", "b"))
+
+
 def test_spots_off_the_dem_are_refused(tmp_path: Path) -> None:
     block = fly(Chain(images=2, ties=40), 0)
     spots = SpotHeights(np.array([(10.0, 50.0, 100.0)]), np.array([0.3]), np.zeros(1), ("a",))

@@ -78,3 +78,16 @@ def test_negative_values_of_a_raster_are_voids_that_it_does_not_declare(tiny, qu
     assert np.isnan(heights[:20]).all()
     assert np.isnan(heights[60:70, 40:50]).all()
     assert np.nanmin(heights) == 1.0
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1.0, np.nan, np.inf, "wide"])
+def test_a_number_that_is_no_sigma_is_refused(sigma: float) -> None:
+    with pytest.raises(InputError, match="is not a standard deviation of heights"):
+        FlatSurface(100.0).with_sigma(sigma)
+
+
+def test_a_sigma_is_a_positive_number_a_surface_or_none() -> None:
+    flat = FlatSurface(100.0)
+    assert flat.with_sigma(2).sigma == 2.0
+    assert flat.with_sigma(flat).sigma is flat
+    assert flat.with_sigma(2).with_sigma(None).sigma is None

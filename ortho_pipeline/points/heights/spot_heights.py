@@ -42,6 +42,11 @@ class SpotHeights:
     ids : tuple of str
     source : str
         The file, for people.
+
+    Raises
+    ------
+    InputError
+        If a standard deviation of a height is not positive and finite, or one of a place is negative or not finite.
     """
 
     ground: Array
@@ -49,6 +54,17 @@ class SpotHeights:
     plan: Array
     ids: tuple[str, ...]
     source: str = ""
+
+    def __post_init__(self) -> None:
+        for sigmas, least in ((self.sigmas, np.nextafter(0.0, 1.0)), (self.plan, 0.0)):
+            wrong = np.flatnonzero(~((sigmas >= least) & (sigmas < np.inf)))
+            if len(wrong):
+                raise InputError(
+                    f"the spot height {self.ids[wrong[0]]} has the standard deviation {sigmas[wrong[0]]}",
+                    file=self.source or None,
+                    field="points.spot_heights",
+                    remedy="give positive metres for heights; for places 0 if it is not known",
+                )
 
     def __len__(self) -> int:
         return len(self.ground)
