@@ -25,6 +25,8 @@ from ortho_pipeline import commands, plugin
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control.command import match
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import BlockOptions, MosaicOptions
+from ortho_pipeline.options.option import options_of
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -444,3 +446,24 @@ def test_a_number_beyond_the_bounds_of_its_option_is_refused(group, values) -> N
         group(**values)
     assert caught.value.field == f"output.{name}"
     assert "MB" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [
+        (op.OutputOptions, "visibility", "nodta"),
+        (op.OutputOptions, "dtype", "uint12"),
+        (op.MatchOptions, "gcps_as", "controls"),
+        (op.PointOptions, "correction", "shfit"),
+        (MosaicOptions, "order", "first"),
+        (MosaicOptions, "format", "TIF"),
+        (BlockOptions, "dem_heights", "no"),
+    ],
+)
+def test_a_value_that_is_no_choice_of_its_option_is_refused_with_the_choices(group, name, value) -> None:
+    with pytest.raises(InputError, match=f"'{value}' is not ") as caught:
+        group(**{name: value})
+    assert str(caught.value.field).endswith(f".{name}")
+    for choice in options_of(group)[name].choices:
+        assert choice in str(caught.value.remedy)
+        assert getattr(group(**{name: choice}), name) == choice

@@ -229,6 +229,7 @@ def _checking(init: Any) -> Any:
             if not fits or not _within(plain, option):
                 form = "True or False" if kind is bool else "a path" if os.PathLike in _types(kind) else "a text"
                 form = _FORMS.get(option.kind, form) + (_range_of(option) if fits else "")
+                form = " or ".join(option.choices) or form
                 group = type(self).__name__.removesuffix("Options").lower()
                 group = {"point": "points", "block": "points"}.get(group, group)
                 raise InputError(f"{reprlib.repr(value)} is not {form}", field=f"{group}.{name}", remedy=f"give {form}")
@@ -238,7 +239,11 @@ def _checking(init: Any) -> Any:
 
 
 def _within(value: Any, option: Option) -> bool:
-    """Return whether a single number is between the bounds of its option."""
+    """Return whether a text is a choice of its option, and a single number between its bounds."""
+    if option.choices and isinstance(value, str):
+        if option.metavar:  # as on the command line
+            return value.lower() in (choice.lower() for choice in option.choices)
+        return value in option.choices
     if not isinstance(value, int | float) or option.above is option.below is None:
         return True
     low, high = -math.inf if option.above is None else option.above, math.inf if option.below is None else option.below
