@@ -295,6 +295,19 @@ def test_options_are_shown_as_they_are_written() -> None:
         (op.MatchOptions, "reference", (name for name in ("a.tif", "b.tif"))),
         (op.PointOptions, "gcps", ["gcps.csv"]),
         (op.SceneOptions, "sensor_options", "a=b"),
+        (op.SceneOptions, "sensor_options", {1: "b"}),
+        (op.OutputOptions, "creation_options", {"COMPRESS": None}),
+        (op.SceneOptions, "roots", [None]),
+        (op.SceneOptions, "roots", [b"folder"]),
+        (op.SceneOptions, "rpc", "a\0b"),
+        (op.MatchOptions, "reference", ["a.tif", math.nan]),
+        (op.OutputOptions, "bands", b"\1"),
+        (op.OutputOptions, "nodata", "none"),
+        (op.OutputOptions, "nodata", True),
+        (op.OutputOptions, "resolution", 10**400),
+        (op.OutputOptions, "resolution", True),
+        (op.SurfaceOptions, "fill", False),
+        (op.SurfaceOptions, "height", True),
     ],
 )
 def test_a_value_of_a_wrong_type_is_refused_with_the_name_of_its_option(group, name, value) -> None:
@@ -307,6 +320,9 @@ def test_a_value_of_a_wrong_type_is_refused_with_the_name_of_its_option(group, n
 def test_values_of_numpy_and_pyproj_are_options() -> None:
     output = op.OutputOptions(resolution=np.float32(20), crs=pyproj.CRS(32636), bands=np.array([1]), nodata=np.uint8(0))
     assert output == op.OutputOptions(resolution=20.0, crs="EPSG:32636", bands=[1], nodata=0)
+    assert op.OutputOptions(creation_options={"BLOCKSIZE": np.int64(256)}).creation_options == {"BLOCKSIZE": "256"}
+    assert op.OutputOptions(bands=[np.int64(1)], extent=tuple(np.arange(4, dtype=np.float32))).bands == [1]
+    assert op.OutputOptions(nodata="-1.7976931348623157e308").nodata
     surface = op.SurfaceOptions(height=np.float32(800))
     json.dumps([output.resolution, output.crs, output.bands, output.nodata, surface.height])
 

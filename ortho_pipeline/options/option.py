@@ -6,7 +6,8 @@ import inspect
 import math
 import os
 import reprlib
-from collections.abc import Sequence
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
@@ -67,11 +68,15 @@ def number_of(text: str | float) -> float:
     >>> number_of("12.5"), number_of("twelve")
     (12.5, nan)
     """
+    number = _float(text)
+    return number if is_usable(number) else math.nan
+
+
+def _float(text: str | float) -> float:
     try:
-        number = float(text)
+        return float(text)
     except (ValueError, OverflowError):
         return math.nan
-    return number if is_usable(number) else math.nan
 
 
 def numbers_of(text: str) -> list[float]:
@@ -240,9 +245,9 @@ def _checking(init: Any) -> Any:
 
 def _within(value: Any, option: Option) -> bool:
     """Return whether a text is a choice of its option, and a single number between its bounds."""
-    if option.choices and isinstance(value, str):
+    if option.choices and value is not None:
         if option.metavar:  # as on the command line
-            return value.lower() in (choice.lower() for choice in option.choices)
+            return str(value).lower() in (choice.lower() for choice in option.choices)
         return value in option.choices
     if not isinstance(value, int | float) or option.above is option.below is None:
         return True
@@ -262,8 +267,17 @@ def _plain(value: Any, form: Kind, kind: Any) -> Any:
         value = value.tolist()
     elif hasattr(value, "to_wkt"):  # a CRS of pyproj
         value = value.to_string()
+    elif type(value) in (list, tuple):
+        value = type(value)(_plain(one, form, kind) for one in value)
+    elif isinstance(value, Mapping):
+        return {name: _plain(one, "text", str) for name, one in value.items()}
+    return str(value) if _is_number(value) and form == "text" and kind is not bool else value
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether this is a number, and no truth value, that a float can hold."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return str(value) if number and form == "text" and kind is not bool else value
+    return number and not sys.float_info.max < abs(value) < math.inf
 
 
 def _types(kind: Any) -> set[Any]:
@@ -271,16 +285,35 @@ def _types(kind: Any) -> set[Any]:
     return {get_origin(member) or member for member in members}
 
 
+def _is_path(value: object) -> bool:
+    return isinstance(value, str | os.PathLike) and "\0" not in os.fspath(value)
+
+
 def _fits(value: Any, form: Kind, kind: Any) -> bool:
     """Return whether a value has the type of its field, and as many numbers as its form needs."""
     types = _types(kind)
+    if isinstance(value, bool):
+        return bool in types
+    if isinstance(value, str) and (form == "number or nan" or "\0" in value):
+        return form == "number or nan" and (value == "nan" or not math.isnan(_float(value)))
     if form in ("text", "file") and kind is not bool:
         return isinstance(value, (*types, os.PathLike))
+    if isinstance(value, int | float):
+        number = bool(types & {float, bool} or form == "number or word" or (int in types and isinstance(value, int)))
+        return number and (kind is bool or _is_number(value))
     if isinstance(value, str):
         return str in types
-    if isinstance(value, int | float):
-        return bool(types & {float, bool} or form == "number or word" or (int in types and isinstance(value, int)))
-    if not isinstance(value, Sequence) or form in ("files", "folders"):
-        return isinstance(value, tuple(types))
+    return os.PathLike in types if isinstance(value, os.PathLike) else _all_fit(value, form, types)
+
+
+def _all_fit(values: Any, form: Kind, types: set[Any]) -> bool:
+    """Return whether values are as many, and of the type, as their form needs."""
+    if isinstance(values, Mapping):
+        return Mapping in types and all(isinstance(name, str) and _is_path(one) for name, one in values.items())
+    if isinstance(values, bytes) or not isinstance(values, Sequence):
+        return False
+    if form in ("files", "folders"):
+        return all(map(_is_path, values))
     counts = {"pair": (2,), "box": (4,), "one or two": (2,), "integers": range(1, 1000)}.get(form, ())
-    return len(value) in counts and all(isinstance(one, int if form == "integers" else int | float) for one in value)
+    numbers = all(map(_is_number, values)) and (form != "integers" or all(isinstance(one, int) for one in values))
+    return len(values) in counts and numbers
