@@ -483,3 +483,17 @@ def test_a_value_that_is_no_choice_of_its_option_is_refused_with_the_choices(gro
     for choice in options_of(group)[name].choices:
         assert choice in str(caught.value.remedy)
         assert getattr(group(**{name: choice}), name) == choice
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+@pytest.mark.parametrize("opened", [op.open_dem, op.open_scene, op.RasterSource], ids=lambda opened: opened.__name__)
+def test_one_folder_in_place_of_a_list_of_roots_allows_no_others(opened, kind, sample: Path, tmp_path: Path) -> None:
+    from osgeo import gdal
+
+    gdal.UseExceptions()
+    image = tmp_path / "inner" / "image.vrt"
+    image.parent.mkdir()
+    gdal.BuildVRT(str(image), [str(sample / "dem.tif")]).FlushCache()
+    with pytest.raises(InputError, match="one folder in place of a list") as caught:
+        opened(image, roots=kind(tmp_path / "other"))
+    assert (caught.value.field, caught.value.remedy) == ("roots", f"give ['{tmp_path / 'other'}']")

@@ -37,6 +37,23 @@ def cache_folder() -> Path | None:
     return Path(above) / "ortho-pipeline" if os.path.isabs(above) else None
 
 
+def listed_folders(roots: Iterable[AnyPath]) -> tuple[AnyPath, ...]:
+    """Return folders of a caller; of one text each character would be a folder, and ``/`` would allow all files.
+
+    Raises
+    ------
+    InputError
+        If it is one path in place of a list.
+    """
+    if isinstance(roots, str | bytes | os.PathLike):
+        raise InputError(
+            f"{os.fspath(roots)!r} is one folder in place of a list",
+            field="roots",
+            remedy=f"give [{os.fspath(roots)!r}]",
+        )
+    return tuple(roots)
+
+
 def ignore_working_folder() -> None:
     """Keep libraries and child processes from taking code or settings from the working folder.
 
