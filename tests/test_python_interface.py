@@ -388,7 +388,13 @@ def test_what_a_masked_array_hides_is_nan(sample: Path) -> None:
     np.testing.assert_array_equal(
         np.isnan(model.image_to_ground([[500, 500], [500, 500]], heights)[:, 2]), [True, False]
     )
+    dem = op.open_dem(sample / "dem.tif")
+    place = np.ma.masked_array(ground.data[:, :2], mask=[[1, 0], [0, 0]])
+    assert np.isnan(dem.heights(place, "EPSG:4326")).tolist() == [True, False]
+    seen = np.ma.masked_array([[500.0, 500.0], [500.0, 500.0]], mask=[[0, 1], [0, 0]])
+    assert np.isnan(op.meet_surface(model, seen, dem)[:, 2]).tolist() == [True, False]
     points = op.Points.of(np.ma.masked_less([[500, 500], [-9, -9]], 0), ground, "EPSG:4979")
+    assert np.isnan(points.with_ground(ground).ground[0, 2])
     assert np.isnan(points.image[1]).all()
     assert np.isnan(points.ground[0, 2])
 
@@ -497,3 +503,11 @@ def test_one_folder_in_place_of_a_list_of_roots_allows_no_others(opened, kind, s
     with pytest.raises(InputError, match="one folder in place of a list") as caught:
         opened(image, roots=kind(tmp_path / "other"))
     assert (caught.value.field, caught.value.remedy) == ("roots", f"give ['{tmp_path / 'other'}']")
+
+
+def test_ground_of_points_is_not_the_array_of_the_caller(sample: Path) -> None:
+    points = op.read_points(sample / "gcps.geojson")
+    ground = points.ground.copy()
+    changed = points.with_ground(ground)
+    ground[:] = 0.0
+    np.testing.assert_array_equal(changed.ground, points.ground)

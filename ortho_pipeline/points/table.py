@@ -259,7 +259,7 @@ class Points:
 
     def with_ground(self, ground: ArrayLike) -> Points:
         """Return these points with other ground coordinates ``(N, 3)`` in the same CRS."""
-        return replace(self, ground=np.asarray(ground, dtype=float))
+        return replace(self, ground=_numbers("ground", ground))
 
     def to_crs(self, target: str | pyproj.CRS) -> Points:
         """Return these points in another CRS; missing heights stay NaN.

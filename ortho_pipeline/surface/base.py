@@ -13,6 +13,7 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.base import as_numbers
 from ortho_pipeline.options import number_of
 
 Array = NDArray[np.float64]
@@ -223,7 +224,7 @@ def positions(xy: ArrayLike) -> Array:
     InputError
         If they have another shape.
     """
-    points = np.asarray(xy, dtype=float)
+    points = as_numbers(xy, "positions")
     if points.ndim != 2 or points.shape[1] < 2:
         raise InputError(f"expected positions of shape (N, 2), not {points.shape}")
     return points[:, :2]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
-from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.models.base import SensorModel, as_image
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
@@ -62,7 +62,7 @@ def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tole
     >>> print(np.round(op.meet_surface(op.open_scene("sample_data/scene.tif").model, [[500.0, 500.0]], dem), 4))
     [[ 33.3497  37.2502 731.0427]]
     """
-    image = np.asarray(image, dtype=float)
+    image = as_image(image)
     if not isinstance(surface, DemSurface):
         return model.image_to_ground(image, surface.height_range[0])
     ray = _Ray(model, image, surface)
