@@ -16,9 +16,10 @@ from osgeo import gdal, osr
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
+from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.models import MapGrid, model_from_dict
-from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.options import MatchOptions, SceneOptions
 from ortho_pipeline.testing import check_sensor_model
 from tests.conftest import SAMPLE
 
@@ -201,3 +202,10 @@ def test_a_band_that_the_ortho_has_not_is_refused(tmp_path: Path) -> None:
     done = CliRunner().invoke(cli, ["verify", str(path), "--reference", str(path), "--compare-band", "2"])
     assert done.exit_code == 2
     assert "there is no band 2: the ortho has 1 band" in done.stderr
+
+
+@pytest.mark.parametrize("band", [0, -1])
+def test_a_band_below_1_is_refused(band: int, tmp_path: Path) -> None:
+    path = raster(tmp_path / "o.tif", *GRIDS["metres"])
+    with pytest.raises(InputError, match=f"there is no band {band}: the ortho has 1 band"):
+        verify(path, match=MatchOptions(reference=[str(path)]), band=band)

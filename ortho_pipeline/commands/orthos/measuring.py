@@ -233,9 +233,10 @@ def _intensity(
     source: RasterSource, bands: Sequence[int], masks: Sequence[ClassMask], opened: SceneOptions
 ) -> Intensity:
     count = len(source.bands)
-    if max(bands, default=1) > count:
+    absent = [band for band in bands if not 1 <= band <= count]
+    if absent:
         raise InputError(
-            f"there is no band {max(bands)}: the ortho has {counted(count, 'band')}",
+            f"there is no band {absent[0]}: the ortho has {counted(count, 'band')}",
             file=source.path,
             field="band",
             remedy=f"give one from 1 to {count}",
