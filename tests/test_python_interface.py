@@ -343,6 +343,15 @@ def test_a_path_in_place_of_options_is_refused_with_the_options(name, value, rem
     assert isinstance(eval(remedy), getattr(op, remedy[3:].partition("(")[0]))
 
 
+@pytest.mark.parametrize("group", ["scene", "points", "surface", "match", "output"])
+@pytest.mark.parametrize("value", [None, 5, op.StackOptions()])
+def test_anything_else_in_place_of_options_is_refused_by_name(group, value, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"is not .*Options") as caught:
+        op.rectify("scene.tif", tmp_path, **{group: value})
+    assert caught.value.field == group
+    assert eval(str(caught.value.remedy).removeprefix("give ")) is not None
+
+
 def test_an_error_names_the_file_of_any_kind_of_path(tmp_path: Path) -> None:
     class Named:
         def __fspath__(self) -> str:

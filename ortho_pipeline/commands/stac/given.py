@@ -59,14 +59,17 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _refuse_plain(arguments: Mapping[str, Any], signature: inspect.Signature) -> None:
-    """Refuse a path or a mapping in place of options."""
+    """Refuse anything else in place of options, such as a path or a mapping."""
     for group, kind in GROUPS.items():
-        value = arguments.get(group)
-        # `output` of some commands is a file.
-        if not isinstance(value, str | os.PathLike | Mapping) or kind.__name__ not in str(signature.parameters[group]):
+        parameter = signature.parameters.get(group)
+        # `output` of some commands is a file, and some take a list of options.
+        if parameter is None or kind.__name__ not in str(parameter):
             continue
-        text = f"**{value!r}"
-        if not isinstance(value, Mapping):
+        value = arguments[group]
+        if value is parameter.default or isinstance(value, kind | Points | list | tuple):
+            continue
+        text = f"**{value!r}" if isinstance(value, Mapping) else ""
+        if isinstance(value, str | os.PathLike):
             file: Any = os.fspath(value)
             text = f"{fields(kind)[0].name}={[file] if group == 'match' else file!r}"
         remedy = f"give op.{kind.__name__}({text})"
