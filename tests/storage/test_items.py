@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from osgeo import gdal
-from servers import serving
+from servers import PublicFolder, running, serving
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import fit, info, rectify
@@ -125,7 +125,7 @@ def test_the_asset_is_that_of_its_role_or_the_one_that_is_named() -> None:
     with pytest.raises(InputError, match=r"several assets.*B00, B01, B02") as caught:
         item_of(document(**bands), "i.json").image()
     assert "i.json#B00" in caught.value.remedy
-    with pytest.raises(InputError, match="no asset is a raster"):
+    with pytest.raises(InputError, match="no asset of the item 'one' is a raster"):
         item_of(document(t=asset("a.txt", type=TEXT)), "i.json").image()
     with pytest.raises(InputError, match="no asset 'nir'"):
         one.image("nir")
@@ -183,6 +183,31 @@ def test_what_may_be_an_item_is_told_by_its_name() -> None:
     assert Location("https://h/one.json?key=1").is_item
     assert not Location("s3://h/one.tif").is_item
     assert not Location("auto").is_item
+
+
+def test_an_answer_that_ends_too_early_is_asked_for_again(tmp_path: Path) -> None:
+    item(tmp_path / "one.json", x=asset("a.tif", "data"))
+
+    class Cut(PublicFolder):
+        def answer(self, handler: Any) -> None:
+            if self.asked["one.json"]:
+                return super().answer(handler)
+            self.asked["one.json"] += 1
+            handler.send_response(200)
+            handler.send_header("Content-Length", "5000")
+            handler.end_headers()
+            handler.wfile.write(b'{"type": "Feature",')
+            handler.close_connection = True
+            return None
+
+    with running(Cut(tmp_path)) as public:
+        assert read_item(f"{public.address}/one.json", allow_network=True).image().href == f"{public.address}/a.tif"
+
+
+def test_an_item_without_a_raster_is_named_in_a_page_of_items() -> None:
+    with pytest.raises(InputError, match="no asset of the item 'one' is a") as caught:
+        item_of(document(), "https://host/items").image()
+    assert caught.value.remedy == "give another item"
 
 
 def test_answers_that_fail_in_passing_are_asked_for_again(tmp_path: Path) -> None:

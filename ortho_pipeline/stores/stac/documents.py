@@ -71,6 +71,8 @@ def _answer(url: str) -> bytes:
         try:
             with opener.open(request, timeout=_TIMEOUT) as reply:
                 data = bytes(reply.read(_MAX_BYTES + 1))
+                if reply.length and len(data) <= _MAX_BYTES:  # the connection ended before the answer
+                    raise http.client.IncompleteRead(data, reply.length)
         except urllib.error.HTTPError as error:
             if error.code not in _PASSING:
                 raise InputError(

@@ -161,10 +161,10 @@ class Item:
                 remedy=f"choose one, for example {self.address}#{several[0].key}",
             )
         raise InputError(
-            f"no asset is a {what}",
+            f"no asset of the item {self.id!r} is a {what}",
             file=self.address,
             field="assets",
-            remedy=f"add the key of one after a #: {self._keys() or 'another item'}",
+            remedy=f"add the key of one after a #: {self._keys()}" if self.assets else "give another item",
         )
 
     def _keys(self, assets: Iterable[Asset] | None = None) -> str:
