@@ -267,6 +267,8 @@ def test_recogniser_and_opener_that_raise_name_their_plugin(tmp_path):
         Host([make_plugin(make_sensor(recognises=fail))]).open_scene(image)
     with pytest.raises(PluginError, match=r"'alpha' of plugin plugin could not open.*oops at test_plugins\.py:\d+"):
         Host([make_plugin(make_sensor(open_scene=fail))]).open_scene(image)
+    with pytest.raises(PluginError, match="report it to the author"):
+        Host([make_plugin(make_sensor(open_scene=fail))]).open_scene(image)
     # What the user can correct is said of the file, where the plugin names none.
     with pytest.raises(InputError, match=r"a\.tif: the band is missing"):
         Host([make_plugin(make_sensor(open_scene=bad_product))]).open_scene(image)

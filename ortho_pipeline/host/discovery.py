@@ -196,7 +196,7 @@ class Host:
             raise
         except (Exception, SystemExit) as error:
             text = described(error, chosen.open_scene)
-            raise PluginError(f"{self._name(chosen)} could not open it ({text})", file=path) from error
+            raise PluginError(f"{self._name(chosen)} could not open it ({text})", file=path, remedy=_TEST_IT) from error
         if fault and self.provenance(chosen.name).bundled:
             # Bundled plugins keep the contract for valid files, so the file is damaged.
             raise InputError(
