@@ -1,5 +1,6 @@
 """The host: discovery, recognition, and what it refuses."""
 
+import json
 import re
 import sys
 import types
@@ -9,13 +10,16 @@ from pathlib import Path
 import numpy as np
 import ortho_rpc
 import pytest
+from click.testing import CliRunner
 from osgeo import gdal
 
 from ortho_pipeline import commands
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError, PluginError
 from ortho_pipeline.exchange.rpc import rpc_metadata, write_rpc_txt
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.host import Host
+from ortho_pipeline.host.discovery import _discovered
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.runtime.signals import Terminated
 
@@ -94,6 +98,20 @@ def test_plugin_that_fails_to_import_is_left_out_with_a_warning(install, caplog,
     assert "third-party 1.2" in caplog.text
     assert host.broken[0].error.split(":")[0] in caplog.text
     assert "rpc" in host.sensors
+
+
+def test_what_a_plugin_prints_does_not_mix_with_the_document_of_a_command(install, tmp_path: Path):
+    talks = PLUGIN.format(name="talkative").replace("lambda dataset: False", "lambda dataset: print('recognising')")
+    install("talkative", "talkative_plugin", f"print('imported')\n{talks}")
+    _discovered.cache_clear()
+    try:
+        done = CliRunner().invoke(cli, ["info", str(make_image(tmp_path / "a.tif", make_rpc())), "--json"])
+        wrong = CliRunner().invoke(cli, ["info", str(make_image(tmp_path / "b.tif")), "--json"])
+    finally:
+        _discovered.cache_clear()
+    assert json.loads(done.stdout)["sensor"] == "rpc"
+    assert done.stderr.startswith("imported\nrecognising\n")
+    assert json.loads(wrong.stdout)["error"]["kind"] == "InputError"
 
 
 def test_bundled_name_cannot_be_shadowed(install):

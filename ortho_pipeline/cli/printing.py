@@ -40,7 +40,9 @@ def print_json(document: Any) -> None:
      "count": 2
     }
     """
-    click.echo(printable_json(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)))
+    context = click.get_current_context(silent=True)
+    stdout = context.meta.get("stdout") if context else None
+    click.echo(printable_json(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)), file=stdout)
 
 
 def print_warnings(warnings: Any) -> None:

@@ -6,6 +6,7 @@ module, and what installed packages declare of the commands that they add.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import functools
 import importlib
@@ -115,7 +116,12 @@ class _Commands(click.Group):
 
             if close := difflib.get_close_matches(args[0], self.list_commands(ctx), 1):
                 ctx.fail(f"No such command '{args[0]}'; did you mean '{close[0]}'?")
-        return super().resolve_command(ctx, args)
+        name, command, rest = super().resolve_command(ctx, args)
+        if name in COMMANDS and "--json" in rest:
+            # What plugins and libraries print must not mix with the document.
+            ctx.meta["stdout"] = sys.stdout
+            ctx.with_resource(contextlib.redirect_stdout(sys.stderr))
+        return name, command, rest
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands in their groups, without loading any."""
