@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ortho_pipeline.cli.machine.terminal import PrintableLog, say
+from ortho_pipeline.cli.machine.terminal import PrintableLog, open_closed_streams, say
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, error_document
 
 if TYPE_CHECKING:
@@ -180,17 +180,13 @@ class _Commands(click.Group):
             say("".join(traceback.format_exception(error)), err=True)
         say(f"Error: {error}", err=True)
         if ctx.meta.get("json"):
-            from ortho_pipeline.cli.printing import print_json
-
-            print_json({"schema_version": 1, "error": error_document(error)})
+            _print_error(error_document(error))
         ctx.exit(code)
 
 
 def _print_usage_error(words: Container[str], error: click.UsageError) -> None:
     """Print the document of an error in the command line itself."""
     if "--json" in words:
-        from ortho_pipeline.cli.printing import print_json
-
         parameter = getattr(error, "param", None)
         field = parameter.opts[0] if parameter is not None else getattr(error, "option_name", None)
         remedy = f"see '{error.ctx.command_path} --help'" if error.ctx is not None else "see 'ortho --help'"
@@ -201,6 +197,14 @@ def _print_usage_error(words: Container[str], error: click.UsageError) -> None:
             "field": field,
             "remedy": remedy,
         }
+        _print_error(document)
+
+
+def _print_error(document: dict[str, Any]) -> None:
+    """Print the document of an error, which may be that stdout cannot be written."""
+    from ortho_pipeline.cli.printing import print_json
+
+    with contextlib.suppress(OSError):
         print_json({"schema_version": 1, "error": document})
 
 
@@ -248,6 +252,7 @@ def main() -> None:
     """Run the command line."""
     from ortho_pipeline.runtime.signals import Terminated, ended_by_signals
 
+    open_closed_streams()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableLog("%(levelname)s: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])

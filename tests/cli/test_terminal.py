@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -51,3 +54,32 @@ def test_a_message_about_data_has_no_control_characters_and_an_end(json: bool, t
     for shown in (done.stderr, done.stdout):
         assert not set(shown) & set("\x1b\x07\x9b\u202e\r\x00")
     assert len(done.stderr) < 10_000
+
+
+#: What runs with closed streams; it has no quotation marks of the shell.
+CLOSED = """
+import os, sys
+from ortho_pipeline.cli.program import main
+sys.argv = ["ortho", "--version"]
+try:
+    main()
+finally:
+    number = os.open(os.environ["HERE"], os.O_CREAT | os.O_WRONLY)
+    os.write(number, f"{number} {sys.stderr.isatty()}".encode())
+"""
+
+
+def test_no_file_takes_the_number_of_a_stream_that_is_closed(tmp_path: Path) -> None:
+    """Else what libraries print would be in an output."""
+    closed = f"exec {sys.executable} -c '{CLOSED}' 0<&- 1>&- 2>&-"
+    done = subprocess.run(["sh", "-c", closed], check=False, env={**os.environ, "HERE": str(tmp_path / "file")})
+    assert done.returncode == 0
+    assert (tmp_path / "file").read_text() == "3 False"
+
+
+def test_an_error_of_a_stdout_that_takes_nothing_is_a_message() -> None:
+    for words, message, code in (("cache list", "Error: cannot write", 1), ("cache", "Usage: ", 2)):
+        line = f"exec {sys.executable} -m ortho_pipeline {words} --json > /dev/full"
+        done = subprocess.run(["sh", "-c", line], check=False, capture_output=True, text=True)
+        assert (done.returncode, done.stderr[: len(message)]) == (code, message)
+        assert "Traceback" not in done.stderr

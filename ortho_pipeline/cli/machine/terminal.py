@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
+import sys
 import unicodedata
 
 import click
@@ -11,6 +13,16 @@ import click
 #: Characters of a line, of which longer ones are cut.
 LONGEST = 4000
 _LINE = re.compile(r"[^\n]+")
+
+
+def open_closed_streams() -> None:
+    """Open standard streams that are closed on the null device.
+
+    The next file that is opened would take the number of the stream, and receive what libraries print.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
 
 
 def printable(text: str) -> str:
