@@ -509,7 +509,7 @@ def test_one_folder_in_place_of_a_list_of_roots_allows_no_others(opened, kind, s
     image = tmp_path / "inner" / "image.vrt"
     image.parent.mkdir()
     gdal.BuildVRT(str(image), [str(sample / "dem.tif")]).FlushCache()
-    with pytest.raises(InputError, match="one folder in place of a list") as caught:
+    with pytest.raises(InputError, match="one path in place of a list") as caught:
         opened(image, roots=kind(tmp_path / "other"))
     assert (caught.value.field, caught.value.remedy) == ("roots", f"give ['{tmp_path / 'other'}']")
 
@@ -520,3 +520,17 @@ def test_ground_of_points_is_not_the_array_of_the_caller(sample: Path) -> None:
     changed = points.with_ground(ground)
     ground[:] = 0.0
     np.testing.assert_array_equal(changed.ground, points.ground)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_one_path_in_place_of_a_list_of_files_is_refused_with_the_list(kind, tmp_path: Path) -> None:
+    reference = op.MatchOptions(reference=["reference.tif"])
+    calls = {
+        "orthos": (lambda path: op.mosaic(path, tmp_path / "m.tif"), lambda path: op.stack(path, tmp_path / "s")),
+        "masks": (lambda path: op.verify("ortho.tif", match=reference, masks=path),),
+    }
+    for field, functions in calls.items():
+        for function in functions:
+            with pytest.raises(InputError, match="one path in place of a list") as caught:
+                function(kind("a.tif"))
+            assert (caught.value.field, caught.value.remedy) == (field, "give ['a.tif']")

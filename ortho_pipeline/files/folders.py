@@ -37,21 +37,18 @@ def cache_folder() -> Path | None:
     return Path(above) / "ortho-pipeline" if os.path.isabs(above) else None
 
 
-def listed_folders(roots: Iterable[AnyPath]) -> tuple[AnyPath, ...]:
-    """Return folders of a caller; of one text each character would be a folder, and ``/`` would allow all files.
+def listed_paths(paths: Iterable[AnyPath], field: str = "roots") -> tuple[AnyPath, ...]:
+    """Return the paths of a caller; of one text each character would be a path, and as a root ``/`` allows all files.
 
     Raises
     ------
     InputError
         If it is one path in place of a list.
     """
-    if isinstance(roots, str | bytes | os.PathLike):
-        raise InputError(
-            f"{os.fspath(roots)!r} is one folder in place of a list",
-            field="roots",
-            remedy=f"give [{os.fspath(roots)!r}]",
-        )
-    return tuple(roots)
+    if isinstance(paths, str | bytes | os.PathLike):
+        name = os.fspath(paths)
+        raise InputError(f"{name!r} is one path in place of a list", field=field, remedy=f"give [{name!r}]")
+    return tuple(paths)
 
 
 def ignore_working_folder() -> None:

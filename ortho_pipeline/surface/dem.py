@@ -20,7 +20,7 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import CoverageError, DatumError, completed
-from ortho_pipeline.files.folders import listed_folders
+from ortho_pipeline.files.folders import listed_paths
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_remedy
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
@@ -83,7 +83,7 @@ def open_dem(
     >>> [round(height, 1) for height in dem.height_range]
     [700.0, 1191.9]
     """
-    access = {"allow_network": allow_network, "roots": listed_folders(roots)}
+    access = {"allow_network": allow_network, "roots": listed_paths(roots)}
     files = matching_files(path)
     name = os.fspath(path)
     file: Samples = DemFile(name, access) if files is None else open_mosaic(name, files, access)

@@ -28,6 +28,7 @@ from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import decoded, read_bounded, read_json
+from ortho_pipeline.files.folders import listed_paths
 from ortho_pipeline.files.locations import Location, VsiPath, located, place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
@@ -243,7 +244,7 @@ def _each_once(given: Iterable[_Given]) -> list[_Given]:
 def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> list[_Given]:
     """Return the images of folders, lists, patterns and STAC items."""
     found: list[_Given] = []
-    for one in given:
+    for one in listed_paths(given, "orthos"):
         name = Location(one)
         if name.is_address:
             found += _far_files(name, options)

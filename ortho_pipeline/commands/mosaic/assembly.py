@@ -11,6 +11,7 @@ from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.results import ENDINGS, Result, attempted, to_store
 from ortho_pipeline.errors import InputError, ReportError
 from ortho_pipeline.files import allowed, states, together, write_json
+from ortho_pipeline.files.folders import listed_paths
 from ortho_pipeline.files.locations import Location, located, place
 from ortho_pipeline.options import MosaicOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
@@ -73,7 +74,7 @@ def mosaic(
     >>> op.RasterSource(result.files["mosaic"]).width
     150
     """
-    paths = [place(located(ortho, allow_network=allow_network)) for ortho in orthos]
+    paths = [place(located(ortho, allow_network=allow_network)) for ortho in listed_paths(orthos, "orthos")]
     options, path = options or MosaicOptions(format="COG"), Path(path)
     if options.format == "VRT":
         _refuse_far(paths, path)

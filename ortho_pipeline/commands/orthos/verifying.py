@@ -34,6 +34,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.ground_residuals import metre_partials, with_reference_height
 from ortho_pipeline.files import Checksums, sha256, together, write_json
+from ortho_pipeline.files.folders import listed_paths
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Scene
@@ -108,7 +109,7 @@ def verify(
             ),
         )  # fmt: skip
     required = [Requirement.parse(text) for text in require]
-    hidden = [ClassMask.parse(text) for text in masks]
+    hidden = [ClassMask.parse(text) for text in listed_paths(masks, "masks")]
     one = _Job(match, points, surface, scene, output, hidden, band, required, command)
     if os.path.isdir(ortho):
         return _verify_folder(Path(ortho), folder, one)

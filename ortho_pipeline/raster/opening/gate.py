@@ -23,7 +23,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.files.folders import listed_folders, listing
+from ortho_pipeline.files.folders import listed_paths, listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, place, within
 from ortho_pipeline.files.shell import converted, typed
 from ortho_pipeline.geodesy.crs_gate import refuse_files
@@ -121,7 +121,7 @@ class _Gate:
             # The sidecars of a link may be next to the link or next to its target.
             here = Path(path)
             folders = [here, here.resolve()] if here.is_dir() else [here.parent, here.resolve().parent]
-            self._roots = [folder.resolve() for folder in (*folders, *map(Path, listed_folders(roots)))]
+            self._roots = [folder.resolve() for folder in (*folders, *map(Path, listed_paths(roots)))]
         self._seen: set[str] = set()
         self.block = DecodedUnit(0, os.fspath(path))
 
