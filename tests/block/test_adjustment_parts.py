@@ -146,7 +146,7 @@ def test_more_than_half_of_the_points_outside_leave_no_heights(outside: int, ref
     whole: Any = SimpleNamespace(ground=ground, active=of)
     inside: Any = SimpleNamespace(active=some)
     problem: Any = SimpleNamespace(
-        active=lambda selection: selection.active, models=models, points=SimpleNamespace(source="")
+        active=lambda selection: selection.active, models=models, points=SimpleNamespace(source=""), heights=None
     )
     lost = (np.arange(50) < outside) | (np.arange(50) >= 48)
     if not refused:

@@ -109,7 +109,7 @@ class _Formats(click.Option):
         from ortho_pipeline import commands
 
         listed = ", ".join(f"{name} ({title})" for name, title in commands.formats().items())
-        self.help = f"{listed}. May be repeated.  [default: rpc-txt,rpb,vrt,tag]"
+        self.help = f"What to write: {listed}. May be repeated.  [default: rpc-txt,rpb,vrt,tag]"
         return super().get_help_record(ctx)
 
 
