@@ -22,6 +22,7 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, refuse_copies, scenes_of, start_of, state_of_files
 from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
+from ortho_pipeline.commands.block_results.models import adjusted_models, exported_models
 from ortho_pipeline.commands.block_results.orthos import (
     make_orthos,
     mosaic_of_orthos,
@@ -38,7 +39,6 @@ from ortho_pipeline.commands.control.block_points import (
     relative_to_reference,
     settled_scenes,
 )
-from ortho_pipeline.commands.rectification import no_rpc
 from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store
@@ -52,7 +52,7 @@ from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import together, write_json, write_text
-from ortho_pipeline.models import ImageCorrection, SensorModel
+from ortho_pipeline.models import SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import (
     BlockOptions,
@@ -152,9 +152,9 @@ def adjust(
     # The block has the last word on the accuracy of the DEM.
     asked = fit.heights is None and points.dem_heights == "on"
     notes = [one for one in (*placed, *gathered.notices) if asked or one.code != "dem-sigma-by-default"]
-    plain = {label: _plain(fit.models[label]) for label in labels}
-    exported, complaints = _exported(plain, files)
-    plan = planned(starts, fit, plain, files, of_orthos, gathered.heights, (scenes[0], surface, orthos))
+    adjusted = adjusted_models(fit, starts, gathered.heights)
+    exported, complaints = exported_models(adjusted, files)
+    plan = planned(starts, fit, adjusted, files, of_orthos, gathered.heights, (scenes[0], surface, orthos))
     complaints += [] if plan is None else plan.notices
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     report = block_report.build_report(
@@ -167,8 +167,8 @@ def adjust(
         dem_unused=surface.dem is not None and points.dem_heights == "off",
     )
     with together(folder, "block"):
-        _write(files, report, fit, starts, exported, record)
-        told = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0]).export(programs, Path(folder), files)
+        _write(files, report, fit, starts, adjusted, exported, record)
+        told = AdjustedBlock(fit, starts, adjusted, gathered.heights, scenes[0]).export(programs, Path(folder), files)
         failure = attempted(lambda: _write_report(files, report, _pictures(starts, scenes[0])), files, "report", "html")
         if plan is not None:
             failure = next(filter(None, (failure, *make_orthos(plan, command, progress).values())), None)
@@ -339,26 +339,6 @@ def _record(
 # -- what came out ---------------------------------------------------------------------------------------------------
 
 
-def _exported(
-    models: Mapping[str, SensorModel], files: dict[str, Path]
-) -> tuple[dict[str, rpc.RpcExport], list[Notice]]:
-    """Return the RPCs of the models, and notices; where no RPC represents a model, remove its file from `files`."""
-    exported, notes = dict[str, rpc.RpcExport](), list[Notice]()
-    for label, model in models.items():
-        try:
-            exported[label] = rpc.export_rpc(model)
-            notes += [notice.in_image(label) for notice in exported[label].warnings]
-        except InputError as error:
-            notes.append(no_rpc(error).in_image(label))
-            del files[f"{label} rpc"]
-    return exported, notes
-
-
-def _plain(model: SensorModel) -> SensorModel:
-    """Return the model without a correction that corrects nothing."""
-    return model.model if isinstance(model, ImageCorrection) and model.correction == "none" else model
-
-
 def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     points = fit.points
     notices = [notice.in_image(label) for label, start in starts.items() for notice in start.scene.notices]
@@ -408,6 +388,7 @@ def _write(
     report: BlockReport,
     fit: BlockFit,
     starts: Mapping[str, Start],
+    models: Mapping[str, SensorModel],
     exported: Mapping[str, rpc.RpcExport],
     record: Mapping[str, Any],
 ) -> None:
@@ -418,7 +399,7 @@ def _write(
         scene = start.scene
         adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **report.adjustment.images[label].to_json()}
         saved = SavedModel(
-            _plain(fit.models[label]),
+            models[label],
             scene.sensor,
             start.source,
             (scene.width, scene.height),

@@ -16,8 +16,10 @@ from ortho_windows import SIDE, tapered, windows
 from osgeo import gdal
 from skimage.registration import phase_cross_correlation
 
+from ortho_pipeline.block.start import Start
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.block_results import orthos as orthos_of_blocks
+from ortho_pipeline.commands.block_results.models import adjusted_models, exported_models
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import CoverageError, InputError
@@ -142,6 +144,25 @@ def test_heights_beyond_a_model_are_an_error_with_masks_too(sample: Path, tmp_pa
     fit: Any = SimpleNamespace(heights=None)
     with pytest.raises(CoverageError, match="image low: heights under the scene are"):
         orthos_of_blocks.OrthoPlan.of(scenes, files, fit, None, asked)
+
+
+def test_rpcs_of_photos_are_for_the_ground(tmp_path: Path) -> None:
+    """The tags of a photo leave the heights of the ground open; no RPC represents a camera so near to them."""
+    write_dem(tmp_path / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")
+    interior = Interior(600, 400, 0.006, 1e-5, 1e-5, k1=-0.002, k2=0.0005)
+    pose = [300_000.0, 2.7e6, 180.0, 0.03, -0.02, 0.5]
+    model = FrameCamera.from_map(interior, "EPSG:32651", pose, heights=(-20.0, 160.0))
+    scene = Scene("photo", "near", 600, 400, {"frame": model}, "EXIF and XMP")
+    fit: Any = SimpleNamespace(heights=None, models={"near": model})
+    made = adjusted_models(
+        fit, {"near": Start(scene, model, "frame", "EXIF")}, open_dem(tmp_path / "dem.tif", "ellipsoid")
+    )
+    files = {"near rpc": tmp_path / "near_RPC.TXT"}
+    exported, notices = exported_models(made, files)
+    assert notices == []
+    assert "near rpc" in files
+    ground = model.image_to_ground([[10.0, 20.0], [300.0, 200.0], [590.0, 390.0]], 80.0)
+    np.testing.assert_allclose(exported["near"].rpc.ground_to_image(ground), model.ground_to_image(ground), atol=0.02)
 
 
 def test_options_of_orthos_need_orthos(sample: Path, tmp_path: Path) -> None:
