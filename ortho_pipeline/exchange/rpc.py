@@ -457,7 +457,7 @@ def export_rpc(
     height_range : (lo, hi), optional
         Ellipsoidal heights (m) to fit. Default: those of the domain.
     force : bool
-        Accept a fit that is off by more than 0.1 px.
+        Accept a fit that is off by more than 0.1 px. One that is off by more than 0.02 px has a notice in `warnings`.
 
     Raises
     ------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 
@@ -24,7 +23,6 @@ WARN_ERROR, REFUSE_ERROR = 0.02, 0.1
 TIKHONOV = 1e-7
 #: Iterations of the weights of a ratio; the best one counts.
 _ITERATIONS = 5
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -104,12 +102,9 @@ def fit_rpc(
             fault if math.isfinite(worst) else "an RPC cannot represent this model over its heights",
             remedy="fit it over a smaller box or height range, or accept the error (force)",
         )
-    message = Notice(
-        "rpc-approximate", f"the RPC represents the model only to {significant(worst, 3)} px", max_error_px=worst
-    )
-    if worst > WARN_ERROR:
-        log.warning("%s", message)
-    return RpcExport(rpc, False, worst, (message,) if worst > WARN_ERROR else ())
+    text = f"the RPC represents the model only to {significant(worst, 3)} px"
+    notices = (Notice("rpc-approximate", text, max_error_px=worst),) if worst > WARN_ERROR else ()
+    return RpcExport(rpc, False, worst, notices)
 
 
 def _fit_ratio(terms: Array, values: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.source import Grid, open_dataset
 
+_log = logging.getLogger(__name__)
 #: How the names of corrected images end.
 _TIF, _VRT = "_aligned.tif", "_aligned.vrt"
 #: Writes the image of a date with a name into a folder.
@@ -125,11 +127,13 @@ class Writer:
             write: WriteImage = functools.partial(write_in, corrected)
             return _Part(raw.inputs, saved, _TIF, write, json_value(placement.surface.provenance))
         try:
-            exported = export_rpc(model).rpc
+            exported = export_rpc(model)
         except InputError:
             # No RPC represents it: the model file is the only output.
             return _Part(raw.inputs, saved)
-        return _Part(raw.inputs, saved, _VRT, functools.partial(_write_rpc, scene, exported, self.scene))
+        for notice in exported.warnings:
+            _log.warning("%s: %s", scene.path, notice)
+        return _Part(raw.inputs, saved, _VRT, functools.partial(_write_rpc, scene, exported.rpc, self.scene))
 
     def _configuration(self, part: _Part) -> dict[str, Any]:
         return {
