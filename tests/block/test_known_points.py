@@ -155,3 +155,11 @@ def test_of_many_contradicting_check_points_the_worst_are_named() -> None:
     control = next(one for one in others if one.fields["point"] == "p21")
     assert "the adjustment still uses it" in str(control)
     assert "the accuracy still counts it" in str(next(one for one in others if one is not control))
+
+
+def test_control_that_is_exact_is_contradicted_by_its_measurements() -> None:
+    """Matched control has a sigma of a millimetre: the text said that its position differs by 0.00 m."""
+    exact = ContradictedPoint(point="m3", role="control", what="ground", metres=0.0004, sigmas=4.6)
+    assert exact.notice().startswith(
+        "control point m3: its image measurements contradict its given position (4.6 sigma); the adjustment still uses"
+    )

@@ -25,6 +25,9 @@ from ortho_pipeline.estimation.statistics import chance_of, rms
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 
+#: The least distance (m) that a text shows. The ground of control with a sigma of a millimetre cannot move so far.
+_SHOWN = 0.005
+
 
 class ContradictedPoint(Record):
     """A known point that the block contradicts, and that was left as it is."""
@@ -46,6 +49,8 @@ class ContradictedPoint(Record):
     def place(self) -> str:
         """How far which part of it is off."""
         what = {"plan": "position in plan", "height": "height", "ground": "position"}[self.what]
+        if self.metres < _SHOWN:
+            return f"its image measurements contradict its given {what} ({self.sigmas:.1f} sigma)"
         return f"its given {what} differs by {self.metres:.2f} m ({self.sigmas:.1f} sigma) from that of the block"
 
 
