@@ -391,3 +391,16 @@ def test_what_succeeded_between_two_images_is_never_more_than_was_tried() -> Non
     last = tied.to_json()["pairs"][-1]
     assert (last["ties"], last["matched"], last["tried"]) == (4, 1, 2)
     assert "b - c: 4 tie points (1 of 2 matches between them succeeded)" in tied.summary()
+
+
+def test_two_images_without_matches_between_them_can_share_ties() -> None:
+    """Most places of the two were found from a third image, and too few were left for a test against each other."""
+    track, image = np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4)
+    parts, why = Components(0.1, 1.0, 0.1), "none of 11 places matched"
+    pairs = (
+        *(PairSummary(both, 4, 4, (0.5, 0.5), parts) for both in ((0, 1), (0, 2))),
+        PairSummary((1, 2), 0, 11, reason=why),
+    )
+    ties = Ties(track, image, np.ones((12, 2)), np.tile(np.eye(2), (12, 1, 1)), pairs)
+    told = Tied(_points(ties, ("a", "b", "c")), ties, 100.0, 10.0).summary()
+    assert told.splitlines()[-1] == f"b - c: 4 tie points through other images ({why})"

@@ -108,7 +108,10 @@ class Tied:
         for entry in document["pairs"]:
             pair = f"{entry['images'][0]} - {entry['images'][1]}"
             if entry["reason"]:
-                lines.append(f"{pair}: no tie points ({entry['reason']})")
+                through = (
+                    f"{counted(entry['ties'], 'tie point')} through other images" if entry["ties"] else "no tie points"
+                )
+                lines.append(f"{pair}: {through} ({entry['reason']})")
                 continue
             column, row = entry["shift_px"]
             lines.append(
