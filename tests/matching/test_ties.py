@@ -23,8 +23,8 @@ from ortho_pipeline.imaging import matching
 from ortho_pipeline.imaging.matching.agreement import refuse_accident
 from ortho_pipeline.imaging.matching.targets import OtherScene
 from ortho_pipeline.imaging.matching.weights import Components, components
-from ortho_pipeline.imaging.ties import Pair, Ties, TieSettings, tie
-from ortho_pipeline.imaging.ties.pairs import PairSummary
+from ortho_pipeline.imaging.ties import Pair, Ties, TieSettings, pairs, tie
+from ortho_pipeline.imaging.ties.pairs import PairSummary, shared
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import MatchOptions
 from ortho_pipeline.raster.intensity import Intensity
@@ -404,3 +404,35 @@ def test_two_images_without_matches_between_them_can_share_ties() -> None:
     ties = Ties(track, image, np.ones((12, 2)), np.tile(np.eye(2), (12, 1, 1)), pairs)
     told = Tied(_points(ties, ("a", "b", "c")), ties, 100.0, 10.0).summary()
     assert told.splitlines()[-1] == f"b - c: 4 tie points through other images ({why})"
+
+
+@pytest.mark.slow
+def test_a_pair_is_placed_if_one_of_its_poses_is_rotated(tmp_path: Path) -> None:
+    """Headings of drones are wrong by some degrees: no shift fits, and chips of one shift do not match."""
+    _, views = looks(tmp_path, [-5.0, 5.0], dem_sigma=1.0, side=300)
+    angle, middle = np.deg2rad(4.5), (150.0, 150.0)
+    slopes = [np.cos(angle) - 1, -np.sin(angle), np.sin(angle), np.cos(angle) - 1]
+    wrong = ImageCorrection(views[0].model, "affine", middle, np.array([0.0, *slopes[:2], 0.0, *slopes[2:]]))
+    view, target = replace(views[0], model=wrong), OtherScene(views[1].intensity, views[1].model)
+    settings = TieSettings(search=25.0, dem_sigma=1.0, rotation_deg=5.0)
+    found = Pair.place(view, target, shared(view, target), 25.0, settings).correction
+    np.testing.assert_allclose(found.matrix @ wrong.matrix, np.eye(2), atol=0.01)
+
+
+def test_ties_of_photos_are_searched_over_rotations_of_their_poses(
+    sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = {name: open_scene(sample / "photos" / f"{name}.jpg") for name in ("photo1", "photo2")}
+    asked = []
+
+    def placed(view: object, targets: object, reach: float, base: int, region: object, rotation_deg: float) -> None:
+        asked.append(rotation_deg)
+        raise InputError("no clear best position")
+
+    monkeypatch.setattr(pairs, "place", placed)
+    monkeypatch.setattr(pairs, "along_sight", lambda *given: None)
+    with pytest.raises(InputError, match="no tie points found"):
+        tie_scenes(scenes, MatchOptions(), FlatSurface(900.0))
+    # Only at the finest level: at coarser ones a shift alone may fit.
+    assert asked[-1] == 5.0
+    assert not any(asked[:-1])

@@ -17,7 +17,7 @@ from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of
 from ortho_pipeline.commands.control.crops import settled_options
-from ortho_pipeline.commands.control.search import search_of
+from ortho_pipeline.commands.control.search import rotation_of, search_of
 from ortho_pipeline.commands.heights.opening import open_surface, require_heights
 from ortho_pipeline.commands.resolved.opening import on_surface
 from ortho_pipeline.commands.resolved.request import Request
@@ -164,6 +164,7 @@ def tie_scenes(
         apart=options.points is None,
         dem_sigma=sigma,
         threads=os.cpu_count() or 1,
+        rotation_deg=max(rotation_of(scene, options) for scene in scenes.values()),
     )
     ties = tie(views, settings)
     notices = [*_few(ties, tuple(scenes)), *_crowded(ties, options.points)]

@@ -53,6 +53,8 @@ class TieSettings:
     threads : int
     memory : int
         Bytes for all of the work, including GDAL's cache.
+    rotation_deg : float
+        Largest rotation of a model relative to another.
     """
 
     search: float
@@ -61,6 +63,7 @@ class TieSettings:
     dem_sigma: float = 10.0
     threads: int = 1
     memory: int = 512_000_000
+    rotation_deg: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -179,7 +182,8 @@ class Pair:
             finest *= 2
         while True:
             try:
-                correction, _ = place(view, [target], max(search, 2.0 * finest), finest, window)
+                turn = settings.rotation_deg if finest == base else 0.0
+                correction, _ = place(view, [target], max(search, 2.0 * finest), finest, window, turn)
             except InputError:
                 # Heights may be better than stated, and some ground has no structure in large pixels.
                 if finest > base:
