@@ -7,6 +7,7 @@ sigmas of the observations, `reliability` the search for gross errors, `intersec
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import replace
@@ -15,7 +16,9 @@ import numpy as np
 
 from ortho_pipeline.block.datum import HOLD, by_control, stated_accuracies, with_datum, with_start_errors
 from ortho_pipeline.block.determination import (
+    missing_most,
     naming_wrong_points,
+    refuse_many_outside,
     refuse_too_few,
     refuse_undetermined,
     uncertain_images,
@@ -56,8 +59,6 @@ from ortho_pipeline.surface.base import Surface
 _MOVED, _WEIGHINGS = 0.02, 3
 #: Part of the points that gross errors of their own may lead out of the models; where it is more, the block is tilted.
 _ASTRAY = 0.05
-#: Part of the points beyond which it is not they that are wrong, but where the images lie.
-_MOST = 0.5
 
 
 @one_blas_thread()
@@ -170,17 +171,39 @@ def _first(
     shared: SharedUnknowns,
     robust: bool,
 ) -> tuple[Solved, Selection, SharedUnknowns]:
-    """Return the solution of everything, what takes part in it, and what is shared."""
+    """Return the solution of everything, what takes part in it, and what is shared.
+
+    If there is none, the points that rays miss most at the start come in when the others have come to rest.
+    """
+    with naming_wrong_points(problem, state, selection):
+        try:
+            return _first_of_all(problem, state, selection, whole, shared, robust)
+        except (DegeneratePoints, NotConverged):
+            _, wrong = missing_most(problem, state, selection)
+            if robust and wrong.any():
+                later = replace(state, local=np.where(wrong[:, None], np.nan, state.local))
+                with contextlib.suppress(DegeneratePoints, NotConverged):
+                    return _first_of_all(problem, later, selection, whole, shared, robust)
+            raise
+
+
+def _first_of_all(
+    problem: BlockProblem,
+    state: State,
+    selection: Selection,
+    whole: Selection,
+    shared: SharedUnknowns,
+    robust: bool,
+) -> tuple[Solved, Selection, SharedUnknowns]:
     # The search for gross errors begins near the minimum as well as at it, but sigmas are found at it.
     tolerance = NEAR if robust and not problem.unstated.any() else EXACT
     solved = attempt(problem, state, whole, tolerance)
     held = _held(solved, state, selection, whole) if robust else None
     near = solved if held is None else held
-    with naming_wrong_points(problem, state, selection):
-        if near.astray is not None:
-            _refuse_many_outside(problem, near.astray, near.without_astray(whole), whole)
-        solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
-        solved, shared = shared.near(solved, inside)
+    if near.astray is not None:
+        refuse_many_outside(problem, near.astray, near.without_astray(whole), whole)
+    solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
+    solved, shared = shared.near(solved, inside)
     if problem.unstated.any():
         solved = reweighed(solved, inside, estimate(solved), tolerance)
     return solved, inside, shared
@@ -207,31 +230,8 @@ def _refuse_too_few(problem: BlockProblem, nowhere: Mask, selection: Selection, 
     try:
         refuse_too_few(problem, selection)
     except TooFewPoints:
-        _refuse_many_outside(problem, nowhere, selection, whole)
+        refuse_many_outside(problem, nowhere, selection, whole)
         raise
-
-
-def _refuse_many_outside(problem: BlockProblem, outside: Mask, inside: Selection, whole: Selection) -> None:
-    """Refuse a block without control whose rays mostly meet outside of the models: then their heights say nothing."""
-    of = problem.active(whole)
-    if (problem.active(inside) & whole.ground).any():
-        return
-    number = int((outside & of).sum())
-    if number > _MOST * of.sum():
-        low, high = (side(model.height_limits[k] for model in problem.models) for k, side in ((0, max), (1, min)))
-        heights = f" (heights {low:.0f} to {high:.0f} m)" if math.isfinite(high - low) else ""
-        text = (
-            f"the rays of {number} of {counted(int(of.sum()), 'point')} are parallel or meet outside of their "
-            f"models{heights}"
-        )
-        remedy = "give control points that two images show"
-        if problem.heights is None:
-            text += (
-                ". Without control points, heights depend on the models of the images, which are not accurate enough "
-                "here"
-            )
-            remedy += ", or a DEM: they fix the heights of the block"
-        raise DegeneratePoints(text, file=problem.points.source or None, remedy=remedy)
 
 
 def _checked_accuracies(accuracies: Mapping[str, float], points: BlockPoints) -> Mapping[str, float]:

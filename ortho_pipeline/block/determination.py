@@ -12,6 +12,7 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.elimination import weakest
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
 from ortho_pipeline.block.equations.solver import Solved
+from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.display.notices import Notice
@@ -24,6 +25,8 @@ from ortho_pipeline.models.base import Array
 
 #: At the start, rays that miss their point by so many times the median, and their own sigma, may be wrong.
 _FAR, _SURE = 2.0, 20.0
+#: Part of the points beyond which it is not they that are wrong, but where the images lie.
+_MOST = 0.5
 #: Points that an error names.
 _NAMED = 10
 
@@ -38,18 +41,8 @@ def naming_wrong_points(problem: BlockProblem, start: State, selection: Selectio
         yield
     except (DegeneratePoints, NotConverged) as error:
         points = problem.points
-        misses = points.measured - predict(problem.frame, start.models, points, start.local)
-        misses[~(selection.rays & np.isfinite(misses).all(axis=1))] = 0.0
-        known = selection.ground[points.point] & misses.any(axis=1)
-        for image in np.unique(points.image[known]):
-            # What all known ground of an image has in common is an error of its start.
-            of = known & (points.image == image)
-            misses[of] -= np.median(misses[of], axis=0)
-        missed = np.hypot(*misses.T)
-        worst = np.zeros(len(points))
-        np.maximum.at(worst, points.point, np.where(missed > _SURE * points.sigma_image, missed, 0.0))
-        median = float(np.median(worst[np.unique(points.point)]))
-        named = [int(k) for k in np.argsort(-worst)[:_NAMED] if worst[k] > _FAR * median]
+        worst, wrong = missing_most(problem, start, selection)
+        named = np.argsort(-worst)[: min(_NAMED, int(wrong.sum()))].tolist()
         if not named:
             raise
         each = ", ".join(f"{points.ids[k]} ({worst[k]:.0f} px)" for k in named)
@@ -61,6 +54,22 @@ def naming_wrong_points(problem: BlockProblem, start: State, selection: Selectio
                 "check these points first, and delete wrong ones", *(("; or ", error.remedy) if error.remedy else ())
             ),
         ) from error
+
+
+def missing_most(problem: BlockProblem, start: State, selection: Selection) -> tuple[Array, Mask]:
+    """Return by how much (px) a ray misses each point ``(N,)`` at the start, and which ones are missed by far most."""
+    points = problem.points
+    misses = points.measured - predict(problem.frame, start.models, points, start.local)
+    misses[~(selection.rays & np.isfinite(misses).all(axis=1))] = 0.0
+    known = selection.ground[points.point] & misses.any(axis=1)
+    for image in np.unique(points.image[known]):
+        # What all known ground of an image has in common is an error of its start.
+        of = known & (points.image == image)
+        misses[of] -= np.median(misses[of], axis=0)
+    missed = np.hypot(*misses.T)
+    worst = np.zeros(len(points))
+    np.maximum.at(worst, points.point, np.where(missed > _SURE * points.sigma_image, missed, 0.0))
+    return worst, np.asarray(worst > _FAR * np.median(worst[np.unique(points.point)]))
 
 
 def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:
@@ -87,6 +96,29 @@ def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:
                 file=points.source or None,
                 remedy=f"measure at least {counted(least, 'point')} in it, or take a simpler model",
             )
+
+
+def refuse_many_outside(problem: BlockProblem, outside: Mask, inside: Selection, whole: Selection) -> None:
+    """Refuse a block without control whose rays mostly meet outside of the models: then their heights say nothing."""
+    of = problem.active(whole)
+    if (problem.active(inside) & whole.ground).any():
+        return
+    number = int((outside & of).sum())
+    if number > _MOST * of.sum():
+        low, high = (side(model.height_limits[k] for model in problem.models) for k, side in ((0, max), (1, min)))
+        heights = f" (heights {low:.0f} to {high:.0f} m)" if math.isfinite(high - low) else ""
+        text = (
+            f"the rays of {number} of {counted(int(of.sum()), 'point')} are parallel or meet outside of their "
+            f"models{heights}"
+        )
+        remedy = "give control points that two images show"
+        if problem.heights is None:
+            text += (
+                ". Without control points, heights depend on the models of the images, which are not accurate enough "
+                "here"
+            )
+            remedy += ", or a DEM: they fix the heights of the block"
+        raise DegeneratePoints(text, file=problem.points.source or None, remedy=remedy)
 
 
 def refuse_undetermined(solved: Solved) -> None:

@@ -15,13 +15,13 @@ from ortho_pipeline.block import adjustment
 from ortho_pipeline.block.adjustment import (
     _held,
     _prepared,
-    _refuse_many_outside,
     _started,
     _weighed,
     _without,
     adjust,
     pseudo_of,
 )
+from ortho_pipeline.block.determination import refuse_many_outside
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import Pseudo
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
@@ -150,16 +150,16 @@ def test_more_than_half_of_the_points_outside_leave_no_heights(outside: int, ref
     )
     lost = (np.arange(50) < outside) | (np.arange(50) >= 48)
     if not refused:
-        _refuse_many_outside(problem, lost, inside, whole)
+        refuse_many_outside(problem, lost, inside, whole)
         return
     with pytest.raises(DegeneratePoints, match=r"rays of 21 of 40 points .* \(heights 50 to 900 m\)"):
-        _refuse_many_outside(problem, lost, inside, whole)
+        refuse_many_outside(problem, lost, inside, whole)
     # Known ground that takes part says where the heights are.
     ground[30] = True
     with pytest.raises(DegeneratePoints):
-        _refuse_many_outside(problem, lost, inside, whole)
+        refuse_many_outside(problem, lost, inside, whole)
     some[30] = True
-    _refuse_many_outside(problem, lost, inside, whole)
+    refuse_many_outside(problem, lost, inside, whole)
 
 
 @pytest.mark.parametrize(("astray", "left", "converged", "held"), [

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from chains import ORIGIN, Chain, fly
 
-from ortho_pipeline.block import determination
+from ortho_pipeline.block import adjustment, determination
 from ortho_pipeline.block.adjustment import _prepared
 from ortho_pipeline.block.determination import (
     naming_wrong_points,
@@ -271,3 +271,29 @@ def test_an_error_of_the_start_that_known_ground_shares_is_no_wrong_point(prepar
         assert [name for name in points.ids if f"{name} (" in str(error.value.message)] == list(named)
         # An error without a remedy gets no second one that is empty.
         assert error.value.remedy == "check these points first, and delete wrong ones"
+
+
+@pytest.mark.parametrize(("robust", "solved"), [(True, True), (True, False), (False, True)])
+def test_without_a_first_solution_points_that_miss_most_come_in_later(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, robust: bool, solved: bool
+) -> None:
+    """A few wrong rays led the first solution astray. What has no place at the start takes part when others rest."""
+    problem, state, selection = prepared
+    points, measured = problem.points, problem.points.measured.copy()
+    measured[np.flatnonzero(points.point == 3)[0]] += 400.0
+    apart = replace(problem, points=replace(points, measured=measured))
+    starts = []
+
+    def first(problem: Any, state: Any, *others: Any) -> str:
+        starts.append(np.flatnonzero(np.isnan(state.local).any(axis=1)).tolist())
+        if len(starts) == 1 or not solved:
+            raise NotConverged(f"attempt {len(starts)}", remedy="more points")
+        return "solved"
+
+    monkeypatch.setattr(adjustment, "_first_of_all", first)
+    if robust and solved:
+        assert adjustment._first(apart, state, selection, selection, "shared", robust) == "solved"  # type: ignore[arg-type]
+    else:
+        with pytest.raises(NotConverged, match=r"^attempt 1\. Wrong points .* miss most at"):
+            adjustment._first(apart, state, selection, selection, "shared", robust)  # type: ignore[arg-type]
+    assert starts == ([[], [3]] if robust else [[]])

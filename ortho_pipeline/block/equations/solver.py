@@ -161,7 +161,8 @@ def attempt(problem: BlockProblem, start: State, selection: Selection, tolerance
 
     What a step leads out of them, as with nearly parallel rays or while the images are far from right, is left out at
     once: nothing is known of it there, and it must not keep the others from where they belong. Where these have come to
-    rest, each such point whose rays meet takes part again, once; so does what has no place at the start (NaN).
+    rest, each such point whose rays meet takes part again, once; so does what has no place at the start (NaN). If that
+    leads more points out than before, they stay out.
 
     Parameters
     ----------
@@ -181,11 +182,11 @@ def attempt(problem: BlockProblem, start: State, selection: Selection, tolerance
     if not back.any():
         return found
     state = replace(found.state, local=np.where(back[:, None], met, found.state.local))
-    gone = gone & ~back
-    again = _inside(problem, state, selection.without(gone, problem.points.point), tolerance)
-    if not again.converged or again.undetermined:
+    left = gone & ~back
+    again = _inside(problem, state, selection.without(left, problem.points.point), tolerance)
+    outside = left if again.astray is None else left | again.astray
+    if not again.converged or again.undetermined or outside.sum() > gone.sum():
         return found
-    outside = gone if again.astray is None else gone | again.astray
     iterations = found.iterations + again.iterations
     return replace(again, iterations=iterations, astray=outside if outside.any() else None)
 
