@@ -16,7 +16,7 @@ from ortho_pipeline.batch.executors import Crew, crew_of
 from ortho_pipeline.batch.paths import key_of_name
 from ortho_pipeline.batch.records import locked
 from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, placed_at, time_of
-from ortho_pipeline.batch.stack.document import record_of
+from ortho_pipeline.batch.stack.document import chips_of, record_of
 from ortho_pipeline.batch.stack.items import items_of, write_items
 from ortho_pipeline.batch.stack.matching import DatePair, Matcher
 from ortho_pipeline.batch.stack.placing import Placed, pixel_of
@@ -35,6 +35,7 @@ from ortho_pipeline.files import retire, together, write_json
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
+from ortho_pipeline.report.stack.chips import ChipSheet
 from ortho_pipeline.report.stack.page import write_page
 from ortho_pipeline.report.stack.records import StackRecord
 from ortho_pipeline.runtime.process_limits import Progress, one_blas_thread
@@ -298,7 +299,8 @@ def _made(planned: _Planned, crew: Crew) -> StackResult:
     outputs = {name: f"{_ALIGNED}/{file}" for name, file in names.items()}
     groups = {"stack": options, "match": planned.match, "surface": planned.surface, "output": planned.output}
     record = record_of(dates, placed, pairs, solved, outputs, groups)
-    files = _documents(planned, dates, record, outdated)
+    chips = chips_of(dates, placed, solved, aligned, names, scene)
+    files = _documents(planned, dates, record, outdated, chips)
     said = summary(record, sum(pair.fresh for pair in pairs))
     return StackResult(files, record.to_json(), said, record=record, access=scene.access)
 
@@ -314,7 +316,7 @@ def _clear_documents(planned: _Planned, dates: Sequence[Dated]) -> None:
 
 
 def _documents(
-    planned: _Planned, dates: Sequence[Dated], record: StackRecord, outdated: Sequence[str]
+    planned: _Planned, dates: Sequence[Dated], record: StackRecord, outdated: Sequence[str], chips: ChipSheet | None
 ) -> dict[str, Any]:
     """Write items, record and page, and remove outdated files of orthos; return the files of the stack."""
     aligned, allowed = planned.part(_ALIGNED), planned.scene.allow_network
@@ -328,7 +330,7 @@ def _documents(
             if planned.output.stac:
                 files["stac"] = write_items(aligned, within, dates, record)
         with together(planned.folder, "stack"):
-            return files | _write_documents(record, Path(planned.folder))
+            return files | _write_documents(record, chips, Path(planned.folder))
     _retire(Objects(planned.folder, allow_network=allowed), [*sorted(items), *outdated])
     if planned.output.stac:
         with delivered(planned.folder, _ITEMS, allow_network=allowed, keep=lambda path: path.name in items) as upload:
@@ -336,14 +338,14 @@ def _documents(
             within.mkdir()
             files["stac"] = f"{aligned.place}/{write_items(aligned, within, dates, record).name}"
     with delivered(planned.folder, "stack", allow_network=allowed, keep=lambda path: True) as upload:
-        written = _write_documents(record, upload.folder)
+        written = _write_documents(record, chips, upload.folder)
     return files | {role: f"{planned.folder}/{path.name}" for role, path in written.items()}
 
 
-def _write_documents(record: StackRecord, folder: Path) -> dict[str, Path]:
+def _write_documents(record: StackRecord, chips: ChipSheet | None, folder: Path) -> dict[str, Path]:
     files = _files_of(folder)
     write_json(files["json"], record.to_json())
-    write_page(record, files["html"])
+    write_page(record, files["html"], chips)
     return files
 
 

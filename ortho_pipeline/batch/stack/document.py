@@ -1,4 +1,4 @@
-"""The document of a stack, from its adjustment."""
+"""The document of a stack, from its adjustment, and the chips of its page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.batch.stack.matching import DatePair
-from ortho_pipeline.batch.stack.placing import Placed
+from ortho_pipeline.batch.stack.placing import Placed, map_grid_of
+from ortho_pipeline.batch.stack.recorded import RecordedFolder
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.commands.resolved.ledger import as_asked, software
 from ortho_pipeline.commands.results import SCHEMA_VERSION
@@ -19,6 +20,9 @@ from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.raster.regridded import part_of
+from ortho_pipeline.report.stack.chips import ChipSheet, DateFiles, sheet_of
 from ortho_pipeline.report.stack.records import (
     CellRecord,
     ClosureRecord,
@@ -29,6 +33,9 @@ from ortho_pipeline.report.stack.records import (
     StackRecord,
     StepRecord,
 )
+
+#: Columns and rows of a chip.
+_CHIP = 128
 
 
 def record_of(
@@ -227,3 +234,47 @@ def _notices(dates: Sequence[Dated], stack: AdjustedStack, matched: Sequence[Dat
         text = f"{moving} of {counted(int(stack.motion.tested.sum()), 'cell')} move, so the stable ground is uncertain"
         found.append(Notice("stack-mostly-moving", text, cells=moving))
     return found
+
+
+def chips_of(
+    dates: Sequence[Dated],
+    placed: Placed,
+    stack: AdjustedStack,
+    aligned: RecordedFolder,
+    names: Mapping[str, str],
+    scene: SceneOptions,
+) -> ChipSheet | None:
+    """Return chips of the dates with the largest corrections; None if nothing can be shown.
+
+    Parameters
+    ----------
+    aligned, names
+        Folder of the aligned orthos, and their files by the names of dates.
+    """
+    place = _chip_place(stack)
+    if place is None:
+        return None
+    whole = np.array([placed.grid.width, placed.grid.height])
+    size = np.minimum(_CHIP, whole)
+    corner = np.clip(np.rint(place - size / 2), 0, whole - size)
+    window = part_of(placed.grid, *corner.tolist(), *size.tolist())
+    middle = corner + size / 2
+    shift = stack.at(middle[None])[0][:, 0]
+    some = []
+    for number, one in enumerate(dates):
+        area = placed.at(map_grid_of(one).corners[:, :2])
+        if stack.determined[number] and (area.min(axis=0) <= middle).all() and (middle <= area.max(axis=0)).all():
+            # That of a raw scene is its ortho with the delivered model.
+            after = aligned.path(names[one.name])
+            some.append(DateFiles(one.name, one.time.isoformat(), _pair(shift[number]), one.path, after))
+    return sheet_of(some, window, _pair(middle), scene.access)
+
+
+def _chip_place(stack: AdjustedStack) -> Array | None:
+    """Return the still place ``(2,)`` px that most accepted pairs see; of several the one nearest to the middle."""
+    cells = stack.cells
+    seen = stack.edges.measured[stack.closures.accepted].sum(axis=0)
+    still = np.flatnonzero((seen > 0) & ~stack.motion.touched(cells))
+    apart = np.hypot(*cells.place.T).round(6)
+    found = min(still.tolist(), key=lambda cell: (-seen[cell], apart[cell], cell), default=None)
+    return None if found is None else cells.middles[found]

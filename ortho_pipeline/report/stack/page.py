@@ -1,4 +1,4 @@
-"""The page of a stack: the timeline of corrections, the graph of pairs, closures, and the map of moving ground."""
+"""The page of a stack: timeline of corrections, graph of pairs, closures, map of moving ground, and chips."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import write_text
 from ortho_pipeline.report.page.advice import WORDS, signals
+from ortho_pipeline.report.stack.chips import ChipSheet
 from ortho_pipeline.report.stack.records import StackRecord
 
 #: Frame of the timeline, space to its left and below; longer side of the map, and its longest arrow, CSS px.
@@ -33,7 +34,7 @@ _FIT = Text(
 )
 
 
-def write_page(record: StackRecord, path: str | os.PathLike[str]) -> None:
+def write_page(record: StackRecord, path: str | os.PathLike[str], chips: ChipSheet | None = None) -> None:
     """Write the page of a stack."""
     drawn, arrow = moving_map(record)
     pairs = [one for one in record.pairs if one.status != "accepted"]
@@ -49,6 +50,7 @@ def write_page(record: StackRecord, path: str | os.PathLike[str]) -> None:
         graph=graph(record).svg(),
         map=None if drawn is None else drawn.svg(),
         arrow=arrow,
+        chips=chips,
         pairs=pairs[:_ROWS],
         sloped=any(one.correction == "affine" for one in record.dates),
         # Each date has its file in its row of the record.
