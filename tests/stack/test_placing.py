@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -36,13 +37,34 @@ def test_the_area_of_a_stack_is_what_matched_dates_share() -> None:
     assert Placed.of(dates[:1]).shared(dates[:1], [(0, 1)])[1].tolist() == [240.0, 240.0]
 
 
+def of_corrections(dates: list[Dated], corrections: Any, determined: Any) -> tuple[Placed, Any, Placed, Any]:
+    """Return the grid of dates and the stack with corrections ``(T, 2)`` px on it, and both for corrected dates."""
+    placed, parts = Placed.of(dates), {one.name: None for one in fields(AdjustedStack)}
+    value = np.zeros((len(dates), 3, 2))
+    value[:, 0] = corrections
+    network = SimpleNamespace(value=value, covariance=np.zeros((2, 3 * len(dates), 3 * len(dates))))
+    made: dict[str, Any] = {
+        "network": network, "determined": np.array(determined), "sloped": np.zeros(len(dates), dtype=bool),
+        "cells": Cells.over(*placed.shared(dates, [(2, 1)])),
+    }  # fmt: skip
+    stack = AdjustedStack(**parts | made)
+    return placed, stack, *placed.of_corrected(dates, stack)
+
+
 def test_dates_that_are_not_corrected_do_not_extend_the_grid() -> None:
     """An ortho of another place, 300 km away, would make all orthos 300 km large."""
     dates = [date(300_000, 240), date(0, 240), date(10, 240)]
-    placed, corrected = Placed.of(dates), np.array([False, True, True])
-    parts: dict[str, Any] = {one.name: None for one in fields(AdjustedStack)}
-    stack = AdjustedStack(**parts | {"cells": Cells.over(*placed.shared(dates, [(2, 1)])), "determined": corrected})
-    found, same = placed.of_corrected(dates, stack)
+    placed, stack, found, same = of_corrections(dates, np.zeros((3, 2)), [False, True, True])
     assert (found.grid.left, found.grid.width, found.grid.height) == (500_000.0, 250, 240)
     before, after = (one.model.image_to_ground(of.cells.middles, 0.0) for one, of in ((placed, stack), (found, same)))
     np.testing.assert_allclose(after, before, atol=1e-6)
+
+
+def test_the_grid_has_the_corrected_area_of_all_dates_and_all_of_the_first() -> None:
+    """A date that shows the ground 30 px too far west is moved east, and its eastern edge must not be lost."""
+    dates = [date(0, 240), date(0, 240), date(0, 240)]
+    placed, _, found, same = of_corrections(dates, [[0.3, -0.4], [-30.2, 0.0], [4.0, 7.6]], [True] * 3)
+    grid, old = found.grid, placed.grid
+    # The second date reaches 30.2 px farther east, the third one 4 px farther west and 7.6 px farther north.
+    assert (grid.left, grid.top, grid.width, grid.height) == (old.left - 4.0, old.top + 8.0, 274, 248)
+    np.testing.assert_allclose(same.cells.low, np.array([4.0, 8.0]))

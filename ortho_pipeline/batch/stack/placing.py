@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
@@ -21,18 +20,13 @@ from ortho_pipeline.surface.base import Surface
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """The grid of a stack: that of its first date, extended to all that are corrected."""
+    """The grid of a stack: that of its first date, extended to the area of all that are corrected."""
 
     grid: Grid
 
     @classmethod
-    def of(cls, dates: Sequence[Dated], some: NDArray[np.bool_] | None = None) -> Placed:
-        """Return the grid of orthos.
-
-        Parameters
-        ----------
-        some : (T,) of bool, optional
-            Dates whose area it has. Default: all.
+    def of(cls, dates: Sequence[Dated]) -> Placed:
+        """Return the grid of orthos as they were delivered.
 
         Raises
         ------
@@ -49,23 +43,36 @@ class Placed:
                     field="orthos",
                     remedy="reproject it to the same CRS, or leave it out",
                 )
-        first = models[0]
+        return cls._over(models[0], np.concatenate([model.corners for model in models]), 1e-6)
+
+    @classmethod
+    def _over(cls, first: MapGrid, corners: Array, least: float) -> Placed:
+        """Return a grid with the pixels of the first date over corners of orthos ``(n, 3)``.
+
+        Less than a part of a pixel (`least`) adds none.
+        """
         step = np.array(first.pixel)
-        seen = np.ones(len(models), dtype=bool) if some is None else some
-        corners = np.concatenate([model.corners for model, is_seen in zip(models, seen, strict=True) if is_seen])
-        origin = first.corners[:, 0].min(), first.corners[:, 1].max()
-        before = np.ceil((origin[0] - corners[:, 0].min()) / step[0] - 1e-6)
-        above = np.ceil((corners[:, 1].max() - origin[1]) / step[1] - 1e-6)
-        left, top = origin[0] - before * step[0], origin[1] + above * step[1]
-        width = int(np.ceil((corners[:, 0].max() - left) / step[0] - 1e-6))
-        height = int(np.ceil((top - corners[:, 1].min()) / step[1] - 1e-6))
-        return cls(Grid(crs, float(left), float(top), float(step[0]), float(step[1]), width, height))
+        origin = np.array([first.corners[:, 0].min(), first.corners[:, 1].max()])
+        places = (corners[:, :2] - origin) / step * (1, -1)
+        begin, end = np.floor(places.min(axis=0) + least), np.ceil(places.max(axis=0) - least)
+        left, top = (origin + begin * step * (1, -1)).tolist()
+        width, height = (end - begin).astype(int).tolist()
+        return cls(Grid(parse_crs(first.map_crs), left, top, float(step[0]), float(step[1]), width, height))
 
     def of_corrected(self, dates: Sequence[Dated], stack: AdjustedStack) -> tuple[Placed, AdjustedStack]:
-        """Return the grid without the area of dates that are not corrected, and the same stack on that grid."""
-        found = Placed.of(dates, stack.determined[: len(dates)])
+        """Return the grid over the corrected area of all dates that are corrected, and the same stack on that grid.
+
+        It has all of the first date as delivered, too: that ortho may be there for its grid.
+        """
+        first = map_grid_of(dates[0])
+        areas = [first.corners] if stack.determined[0] else []
+        for number, one in enumerate(dates):
+            if stack.determined[number]:
+                corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (one.scene.width, one.scene.height)
+                areas.append(self.corrected(one, stack, number).image_to_ground(corners, 0.0))
+        # Pixels whose middle is outside have no value.
+        found = Placed._over(first, np.concatenate(areas), 0.5)
         old, new = self.grid, found.grid
-        # Both have the pixels of the first date.
         moved = np.rint([(new.left - old.left) / old.dx, (old.top - new.top) / old.dy])
         return found, replace(stack, cells=stack.cells._replace(low=stack.cells.low - moved))
 
