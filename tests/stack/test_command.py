@@ -369,6 +369,9 @@ def test_a_stack_in_which_no_date_can_be_corrected_is_refused(made, tmp_path):
 def test_a_datum_that_is_no_date_and_another_crs_are_refused(made, tmp_path):
     with pytest.raises(InputError, match="no ortho is of 1999-01-01"):
         run(made[0], tmp_path / "out", StackOptions(datum="1999-01-01"))
+    with pytest.raises(InputError, match="'median' is neither a date nor the name of an image") as caught:
+        run(made[0], tmp_path / "out", StackOptions(datum="median"))
+    assert caught.value.field == "stack.datum"
     (tmp_path / "list.csv").write_text("file,date\n" + "".join(f"{path},2020-01-01\n" for path in made[0][:2]))
     with pytest.raises(InputError, match="2 images are of 2020-01-01: scene_") as caught:
         run([tmp_path / "list.csv"], tmp_path / "out", StackOptions(datum="2020-01-01"))

@@ -378,7 +378,12 @@ def _with_datum(
     for number, one in enumerate(dates):
         if one.name == datum:
             return list(dates), number
-    wanted = time_of(datum).date()
+    such = f"give mean, reference, or a date such as {dates[0].time.date()}"
+    try:
+        wanted = time_of(datum).date()
+    except InputError as error:
+        text = f"{datum[:40]!r} is neither a date nor the name of an image"
+        raise InputError(text, field="stack.datum", remedy=such) from error
     numbers = [number for number, one in enumerate(dates) if one.time.date() == wanted]
     if len(numbers) > 1:
         names = [dates[number].name for number in numbers]
@@ -389,9 +394,7 @@ def _with_datum(
         )
     if numbers:
         return list(dates), numbers[0]
-    raise InputError(
-        f"no ortho is of {wanted}", field="stack.datum", remedy=f"give mean, or a date such as {dates[0].time.date()}"
-    )
+    raise InputError(f"no ortho is of {wanted}", field="stack.datum", remedy=such)
 
 
 def _refuse_reference(dates: Sequence[Dated], match: MatchOptions) -> None:
