@@ -104,6 +104,12 @@ def test_assets_of_one_name_have_the_ids_of_their_items(tmp_path):
         "file,date\n0/item.json#b,2020-01-05\n1/item.json,\n2/item.json,\n3/item.json,\n"
     )
     names = ["x_S2_1_B04", "x_S2_2_B04", "B04_3", "x_S2_1_4_B04"]
+    (tmp_path / "items").mkdir()
+    for number in range(4):
+        text = (tmp_path / str(number) / "item.json").read_text().replace('"href": "', f'"href": "../{number}/')
+        (tmp_path / "items" / f"{number}.json").write_text(text)
+    within = SceneOptions(roots=[tmp_path])
+    assert [one.name for one in dated_orthos([tmp_path / "items"], options=within)] == names
     for given in (["*/item.json#b"], ["[0-9]/item.json", "0/B04.tif"], [f"{number}/item.json" for number in range(4)]):
         assert [one.name for one in dated_orthos([tmp_path / one for one in given])] == names
     found = dated_orthos([tmp_path / "list.csv", tmp_path / "0" / "B04.tif"])

@@ -150,7 +150,7 @@ def dated_orthos(
         raise InputError(
             f"a stack needs at least two images, not {len(found)}",
             field="orthos",
-            remedy=f"give a folder with orthos ({', '.join(RASTERS)})",
+            remedy=f"give a folder with orthos ({', '.join(RASTERS)}) or STAC items",
         )
     dated = []
     for one in found:
@@ -242,7 +242,7 @@ def _each_once(given: Iterable[_Given]) -> list[_Given]:
 
 
 def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> list[_Given]:
-    """Return the images of folders, lists, patterns and STAC items."""
+    """Return the images of folders, lists, patterns and STAC items; of a folder without images those of its items."""
     found: list[_Given] = []
     for one in listed_paths(given, "orthos"):
         name = Location(one)
@@ -251,8 +251,9 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
             continue
         path = placed_at(name.document if name.is_item else name, options)
         if path.is_dir():
-            rasters = (file for file in path.iterdir() if file.suffix.lower() in RASTERS)
-            found += [_Given(file) for file in sorted(rasters, key=str)]
+            inside: list[Place] = sorted(path.iterdir(), key=str)
+            images = [_Given(file) for file in inside if file.suffix.lower() in RASTERS]
+            found += images or [_one(Location(file), options) for file in inside if Location(file).is_item]
         elif path.suffix.lower() in (".csv", ".txt") and path.is_file():
             found += _listed(path, options)
         elif not path.exists() and any(mark in name for mark in "*?["):
@@ -260,9 +261,9 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
             if not matches:
                 raise InputError("no file has such a name", file=path, field="orthos", remedy="check the pattern")
             # A pattern such as scenes/* has side-cars, too.
-            images = [file for file in matches if Path(file).suffix.lower() in RASTERS]
+            rasters = [file for file in matches if Path(file).suffix.lower() in RASTERS]
             asset = f"#{name.asset}" if name.asset else ""
-            found += [_one(Location(f"{file}{asset}"), options) for file in images or matches]
+            found += [_one(Location(f"{file}{asset}"), options) for file in rasters or matches]
         else:
             found.append(_one(name, options))
     ask_beside(*(one.path for one in found), allow_network=options.allow_network)
