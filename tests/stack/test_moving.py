@@ -213,7 +213,7 @@ def test_areas_touch_at_corners_and_the_largest_is_first() -> None:
     motion = Motion(moving, moving, rate, rate + 1.0, np.zeros(15), np.full(15, "steady"))
     areas = motion.areas(cells)
     assert [one.tolist() for one in areas] == [[4, 8, 14], [0], [10]]
-    middle, sigma = motion.typical(areas[0], cells)
+    middle, sigma, _ = motion.typical(areas[0], cells)
     assert middle.tolist() == [8.0, -64.0]
     assert sigma == np.median([5, 9, 15, -15, -63, -195])
 
@@ -227,7 +227,22 @@ def test_cells_next_to_still_ground_have_no_part_in_the_rate_of_an_area() -> Non
     rate = np.where(inner, 1.0, 0.3).ravel()[:, None] * np.ones(2)
     sigma = np.where(inner, 0.02, 0.05).ravel()[:, None] * np.ones(2)
     motion = Motion(moving.ravel(), tested.ravel(), rate, sigma, np.zeros(42), np.full(42, "steady"))
-    middle, spread = motion.typical(motion.areas(cells)[0], cells)
+    middle, spread, _ = motion.typical(motion.areas(cells)[0], cells)
     assert (middle.tolist(), spread) == ([1.0, 1.0], 0.02)
     narrow = np.flatnonzero(moving.ravel())[:5]
     assert motion.typical(narrow, cells)[0].tolist() == [0.3, 0.3]
+
+
+def test_an_area_without_inner_cells_has_the_rate_of_its_fastest_cell() -> None:
+    """All cells of a small area are at its rim, and show a part of its motion; one is faster only by its noise."""
+    cells = Cells(np.zeros(2), 10.0, (5, 4))
+    share, spread = np.zeros((4, 5)), np.full((4, 5), 0.01)
+    share[1:3, 1:4] = [[0.15, 0.8, 0.2], [0.3, 0.6, 0.9]]
+    spread[2, 2], spread[2, 3] = 0.001, 0.2
+    rate, sigma = share.ravel()[:, None] * [0.6, -0.8], spread.ravel()[:, None] * [1.0, 1.0]
+    ratio = (share / spread).ravel() ** 2
+    motion = Motion(share.ravel() > 0, np.ones(20, dtype=bool), rate, sigma, ratio, np.full(20, "steady"))
+    found, of_found, square = motion.typical(motion.areas(cells)[0], cells)
+    np.testing.assert_allclose(found, [0.48, -0.64])
+    # What a row states belongs together: the rate is so many sigmas.
+    assert np.hypot(*found) / of_found == pytest.approx(np.sqrt(square)) == pytest.approx(80.0)

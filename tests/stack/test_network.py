@@ -90,7 +90,7 @@ def test_the_rate_of_an_area_is_that_of_the_ground_and_not_of_its_rim():
     motion = adjust(
         made.truth.cells, dataclasses.replace(edges, value=value, variance=variance), made.years.tolist()
     ).motion
-    rate, sigma = motion.typical(motion.areas(made.truth.cells)[0], made.truth.cells)
+    rate, sigma, _ = motion.typical(motion.areas(made.truth.cells)[0], made.truth.cells)
     np.testing.assert_allclose(rate, [0.8, -0.6], atol=4 * sigma)
     assert sigma < 0.05
 

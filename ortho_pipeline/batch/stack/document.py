@@ -201,16 +201,17 @@ def _moving(stack: AdjustedStack, placed: Placed, metres: Array) -> list[MovingR
     to_lon_lat = ground_transform(placed.model.crs, "EPSG:4979")
     cell = (stack.cells.side**2) * abs(float(np.linalg.det(metres)))
     for area in motion.areas(stack.cells):
-        rate, sigma = motion.typical(area, stack.cells)
+        rate, sigma, ratio = motion.typical(area, stack.cells)
         rate, sigma = metres @ rate, sigma * float(np.sqrt(abs(np.linalg.det(metres))))
         middle = placed.model.image_to_ground(stack.cells.middles[area].mean(axis=0)[None], 0.0)
         lon, lat, _ = to_lon_lat(middle)[0]
-        strongest = area[int(motion.ratio[area].argmax())]
+        core = motion.core(area, stack.cells)
+        strongest = core[int(motion.ratio[core].argmax())]
         found.append(
             MovingRecord(
                 lon=float(lon), lat=float(lat), cells=len(area), area_m2=len(area) * cell,
                 east_m_per_year=float(rate[0]), north_m_per_year=float(rate[1]), sigma_m_per_year=sigma,
-                significance=float(np.sqrt(motion.ratio[strongest])), form=str(motion.form[strongest]),
+                significance=float(np.sqrt(ratio)), form=str(motion.form[strongest]),
             )
         )  # fmt: skip
     return found

@@ -74,17 +74,26 @@ class Motion:
         found = [np.flatnonzero(numbered.ravel() == number + 1) for number in range(count)]
         return sorted(found, key=lambda one: (-len(one), one[0]))
 
-    def typical(self, area: NDArray[np.int_], cells: Cells) -> tuple[Array, float]:
-        """Return the rate ``(2,)`` of an area and its sigma along an axis, px a year: medians of its cells.
+    def core(self, area: NDArray[np.int_], cells: Cells) -> NDArray[np.int_]:
+        """Return the cells of an area that show how it moves: those inside, or its fastest one if all are at the rim.
 
-        Cells at the rim move in part: those next to still ground do not count, if there are others. Neighbours share
-        errors, so the median is no more certain than one cell.
+        Cells next to still ground move in part, because their chips show both. The fastest one shows most of the
+        motion; it is fast beyond its 95 % interval, because noise makes cells fast, too.
         """
         columns, rows = cells.shape
         still = (self.tested & ~self.moving).reshape(rows, columns)
         inner = area[~ndimage.binary_dilation(still, _NEXT).ravel()[area]]
-        some = inner if len(inner) else area
-        return np.median(self.rate[some], axis=0), float(np.median(self.sigma[some]))
+        fast = np.hypot(*self.rate[area].T) - 1.96 * self.sigma[area].max(axis=1)
+        return inner if len(inner) else area[[int(fast.argmax())]]
+
+    def typical(self, area: NDArray[np.int_], cells: Cells) -> tuple[Array, float, float]:
+        """Return the rate ``(2,)`` of an area, its sigma along an axis (px a year) and its ratio: medians of its core.
+
+        Neighbours share errors, so the median is no more certain than one cell.
+        """
+        some = self.core(area, cells)
+        ratio = float(np.median(self.ratio[some]))
+        return np.median(self.rate[some], axis=0), float(np.median(self.sigma[some])), ratio
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,10 @@ class ClosureRecord(Record):
 
 
 class MovingRecord(Record):
-    """Ground that moves, relative to the stable ground; rates and sigmas are medians of its inner cells, m a year."""
+    """Ground that moves, relative to the stable ground; rate and sigma in m a year.
+
+    Rate, sigma and significance are medians of its inner cells; of an area without any, those of its fastest cell.
+    """
 
     lon: float
     lat: float
