@@ -68,7 +68,7 @@ def test_an_ortho_in_a_system_without_a_code_has_its_report(tiny, tmp_path, crs,
 
 
 def test_a_mosaic_and_the_layers_know_such_a_system_too(tiny, tmp_path):
-    result = rectified(tiny, tmp_path / "out", NAMED, accuracy_raster=True, angles=True, visibility="layer")
+    result = rectified(tiny, tmp_path / "out", NAMED, accuracy_raster=True, angles=True, visibility="mask")
     joined = mosaic([result.files["ortho"]], tmp_path / "m.tif")
     document = joined.document["mosaic"]
     assert document["crs_name"] == "Site grid of the mine"
