@@ -106,7 +106,8 @@ def test_what_is_minimised_is_the_weighted_sum_of_all_squares(prepared: Prepared
     assert linear.misfits.square == pytest.approx(float(linear.misfits.vector @ linear.misfits.vector))
     # Weights that are changed later are those that are there at once.
     plain = Selection.of(weights.rays, weights.ground)
-    again = Linear.at(problem, away, plain).reweighted(weights)
+    less = replace(plain, ray_weights=0.5 * plain.ray_weights, ground_weights=0.25 * plain.ground_weights)
+    again = Linear.at(problem, away, plain).reweighted(less).reweighted(weights)
     for name in ("by_params", "by_point", "ground_by_point"):
         np.testing.assert_allclose(getattr(again, name), getattr(linear, name), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(again.misfits.vector, linear.misfits.vector, rtol=1e-10, atol=1e-12)
