@@ -41,6 +41,11 @@ def unpacked(tmp_path_factory) -> Path:
     return found
 
 
+def test_no_image_of_the_repository_has_a_sidecar_of_gdal():
+    """GDAL writes such files next to images that it looks at; this one gave the raw scene a geotransform."""
+    assert not run("git", "ls-files", "*.aux.xml", cwd=ROOT)
+
+
 def test_it_has_what_the_repository_has(unpacked):
     tracked = run("git", "ls-files", cwd=ROOT).splitlines()
     missing = [name for name in tracked if Path(name).parts[0] not in LEFT and not (unpacked / name).exists()]
