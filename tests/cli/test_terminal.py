@@ -58,23 +58,25 @@ def test_a_message_about_data_has_no_control_characters_and_an_end(json: bool, t
 
 #: What runs with closed streams; it has no quotation marks of the shell.
 CLOSED = """
-import os, sys
+import os, subprocess, sys
 from ortho_pipeline.cli.program import main
 sys.argv = ["ortho", "--version"]
 try:
     main()
 finally:
     number = os.open(os.environ["HERE"], os.O_CREAT | os.O_WRONLY)
-    os.write(number, f"{number} {sys.stderr.isatty()}".encode())
+    inner = "import sys; sys.exit(None in (sys.stdin, sys.stdout, sys.stderr))"
+    code = subprocess.call([sys.executable, "-c", inner])
+    os.write(number, f"{number} {sys.stderr.isatty()} {code}".encode())
 """
 
 
 def test_no_file_takes_the_number_of_a_stream_that_is_closed(tmp_path: Path) -> None:
-    """Else what libraries print would be in an output."""
+    """Else what libraries print would be in an output. Worker processes have all streams, too."""
     closed = f"exec {sys.executable} -c '{CLOSED}' 0<&- 1>&- 2>&-"
     done = subprocess.run(["sh", "-c", closed], check=False, env={**os.environ, "HERE": str(tmp_path / "file")})
     assert done.returncode == 0
-    assert (tmp_path / "file").read_text() == "3 False"
+    assert (tmp_path / "file").read_text() == "3 False 0"
 
 
 def test_an_error_of_a_stdout_that_takes_nothing_is_a_message() -> None:

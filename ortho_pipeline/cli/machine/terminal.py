@@ -18,11 +18,14 @@ _LINE = re.compile(r"[^\n]+")
 def open_closed_streams() -> None:
     """Open standard streams that are closed on the null device.
 
-    The next file that is opened would take the number of the stream, and receive what libraries print.
+    The next file that is opened would take the number of the stream, and receive what libraries print. Worker
+    processes inherit them.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
+            stream = open(os.devnull, mode)  # noqa: SIM115
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
 
 
 def printable(text: str) -> str:
