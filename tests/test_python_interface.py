@@ -323,6 +323,7 @@ def test_values_of_numpy_and_pyproj_are_options() -> None:
     assert op.OutputOptions(creation_options={"BLOCKSIZE": np.int64(256)}).creation_options == {"BLOCKSIZE": "256"}
     assert op.OutputOptions(bands=[np.int64(1)], extent=tuple(np.arange(4, dtype=np.float32))).bands == [1]
     assert op.OutputOptions(nodata="-1.7976931348623157e308").nodata
+    assert op.OutputOptions(nodata="NaN").nodata
     surface = op.SurfaceOptions(height=np.float32(800))
     json.dumps([output.resolution, output.crs, output.bands, output.nodata, surface.height])
 

@@ -295,7 +295,7 @@ def _fits(value: Any, form: Kind, kind: Any) -> bool:
     if isinstance(value, bool):
         return bool in types
     if isinstance(value, str) and (form == "number or nan" or "\0" in value):
-        return form == "number or nan" and (value == "nan" or not math.isnan(_float(value)))
+        return form == "number or nan" and (value.lower() == "nan" or not math.isnan(_float(value)))
     if form in ("text", "file") and kind is not bool:
         return isinstance(value, (*types, os.PathLike))
     if isinstance(value, int | float):
