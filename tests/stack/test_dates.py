@@ -108,6 +108,8 @@ def test_assets_of_one_name_have_the_ids_of_their_items(tmp_path):
     for number in range(4):
         text = (tmp_path / str(number) / "item.json").read_text().replace('"href": "', f'"href": "../{number}/')
         (tmp_path / "items" / f"{number}.json").write_text(text)
+    (tmp_path / "items" / "collection.json").write_text('{"type": "Collection", "stac_version": "1.0.0"}')
+    (tmp_path / "items" / "gcps.geojson").write_text('{"type": "FeatureCollection", "features": []}')
     within = SceneOptions(roots=[tmp_path])
     assert [one.name for one in dated_orthos([tmp_path / "items"], options=within)] == names
     for given in (["*/item.json#b"], ["[0-9]/item.json", "0/B04.tif"], [f"{number}/item.json" for number in range(4)]):

@@ -34,7 +34,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.stores.sidecars import ask_beside
-from ortho_pipeline.stores.stac.item import read_item
+from ortho_pipeline.stores.stac.item import is_item_file, read_item
 
 #: A list and a JSON document next to an ortho are no larger.
 _BYTES = 50_000_000
@@ -253,7 +253,7 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
         if path.is_dir():
             inside: list[Place] = sorted(path.iterdir(), key=str)
             images = [_Given(file) for file in inside if file.suffix.lower() in RASTERS]
-            found += images or [_one(Location(file), options) for file in inside if Location(file).is_item]
+            found += images or [_one(Location(file), options) for file in inside if is_item_file(file)]
         elif path.suffix.lower() in (".csv", ".txt") and path.is_file():
             found += _listed(path, options)
         elif not path.exists() and any(mark in name for mark in "*?["):

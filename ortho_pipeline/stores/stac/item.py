@@ -189,6 +189,17 @@ def read_item(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPat
     return item_of(read_document(path, allow_network=allow_network), path, roots)
 
 
+def is_item_file(path: AnyPath) -> bool:
+    """Return whether a file is a STAC item, and no collection, GeoJSON or other JSON.
+
+    Raises
+    ------
+    InputError
+        If its name is that of a JSON file, and it cannot be read.
+    """
+    return Location(path).is_item and _is_item(read_document(path, allow_network=False))
+
+
 @reads(REMEDY)
 def item_at(path: AnyPath, *, allow_network: bool, roots: tuple[AnyPath, ...]) -> Item | None:
     """Read a STAC item as `read_item` does; None if it is a collection."""
@@ -196,9 +207,13 @@ def item_at(path: AnyPath, *, allow_network: bool, roots: tuple[AnyPath, ...]) -
     return None if document.get("type") in COLLECTIONS else item_of(document, path, roots)
 
 
+def _is_item(document: Mapping[str, Any]) -> bool:
+    return document.get("type") == "Feature" and isinstance(document.get("stac_version"), str)
+
+
 def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath, ...] = ()) -> Item:
     """Return the item that a JSON object is; see `read_item`."""
-    if document.get("type") != "Feature" or not isinstance(document.get("stac_version"), str):
+    if not _is_item(document):
         raise InputError("this is not a STAC item", file=address, field="stac_version", remedy=REMEDY)
     assets = document.get("assets")
     if not isinstance(assets, dict):
