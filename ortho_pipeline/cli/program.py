@@ -117,7 +117,7 @@ class _Commands(click.Group):
             if close := difflib.get_close_matches(args[0], self.list_commands(ctx), 1):
                 ctx.fail(f"No such command '{args[0]}'; did you mean '{close[0]}'?")
         name, command, rest = super().resolve_command(ctx, args)
-        if name in COMMANDS and "--json" in rest:
+        if name in COMMANDS and "--json" in rest and not {*ctx.help_option_names} & {*rest}:
             # What plugins and libraries print must not mix with the document.
             ctx.meta["stdout"] = sys.stdout
             ctx.with_resource(contextlib.redirect_stdout(sys.stderr))

@@ -24,6 +24,11 @@ from ortho_pipeline.commands.survey.pipeline_file import text
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "sample_data"
 
 
+@pytest.mark.parametrize("word", ["--help", "-h"])
+def test_help_is_on_stdout_with_json_too(word):
+    assert CliRunner().invoke(cli, ["info", "--json", word]).stdout.startswith("Usage: ")
+
+
 def test_an_unknown_command_names_the_nearest():
     done = CliRunner().invoke(cli, ["rectfy", "scene.tif"])
     assert done.exit_code == 2
