@@ -528,7 +528,10 @@ def test_one_path_in_place_of_a_list_of_files_is_refused_with_the_list(kind, tmp
     reference = op.MatchOptions(reference=["reference.tif"])
     calls = {
         "orthos": (lambda path: op.mosaic(path, tmp_path / "m.tif"), lambda path: op.stack(path, tmp_path / "s")),
-        "masks": (lambda path: op.verify("ortho.tif", match=reference, masks=path),),
+        "masks": (
+            lambda path: op.verify("ortho.tif", match=reference, masks=path),
+            lambda path: op.align("ortho.tif", tmp_path / "a", match=reference, masks=path),
+        ),
     }
     for field, functions in calls.items():
         for function in functions:

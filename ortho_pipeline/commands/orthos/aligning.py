@@ -28,6 +28,7 @@ from ortho_pipeline.estimation.statistics import chance_of_mean
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
 from ortho_pipeline.files import retire, staged, states, together, write_json
+from ortho_pipeline.files.folders import listed_paths
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.matching.matcher import held_out
@@ -104,7 +105,7 @@ def align(
     """
     _refuse_unusable(Location(ortho), match, bending, resample)
     output = OutputOptions(resampling="cubic") if output is None else output
-    hidden = [ClassMask.parse(text) for text in masks]
+    hidden = [ClassMask.parse(text) for text in listed_paths(masks, "masks")]
     request = Request(ortho, scene, match=match, output=output)
     ledger = Ledger(begun=states([*(path for _, path in request.files), *(mask.path for mask in hidden)]))
     measured = measure_ortho(ortho, match, scene=scene, masks=hidden, band=band, output=output)
