@@ -97,6 +97,8 @@ def programs(given: argparse.Namespace, job: Job) -> dict[str, Program]:
         found["orthority"] = _orthority(given.orthority)
     if otb_works(job, job.folder / "otb.tif"):
         found["OTB"] = Program(lambda job, out: otb(job, out / "ortho.tif"))
+    else:
+        print("Skipped: OTB is not installed (apt-get install otb-bin), or does not take the scene", file=sys.stderr)
     return found
 
 
