@@ -81,15 +81,21 @@ def test_the_cartosat_pair_on_one_grid(sample: Path, tmp_path: Path) -> None:
     assert document["mosaic"]["seams"]
 
 
-@pytest.mark.parametrize(("fill", "told"), [("error", "the DEM covers 0.0 % of the scene"), ("mask", "no pixels")])
-def test_an_image_outside_the_dem_is_named(tmp_path: Path, fill: str, told: str) -> None:
-    """One photo of many is 900 m west of the DEM."""
-    write_dem(tmp_path / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")
+def photos_and_dem(folder: Path, **east: float) -> dict[str, Scene]:
+    """Write a DEM ``dem.tif`` of one height; return photos 100 m above it, some of which are not over it."""
+    write_dem(folder / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")
     scenes = {}
-    for name, x in (("near", 300_000.0), ("far", 299_100.0)):
+    for name, x in east.items():
         interior = Interior(600, 400, 0.006, 1e-5, 1e-5)
         model = FrameCamera.from_map(interior, "EPSG:32651", [x, 2.7e6, 180.0, 0, 0, 0], frame="map", heights=(0, 100))
         scenes[name] = Scene("frame", name, 600, 400, {"frame": model}, "table")
+    return scenes
+
+
+@pytest.mark.parametrize(("fill", "told"), [("error", "the DEM covers 0.0 % of the scene"), ("mask", "no pixels")])
+def test_an_image_outside_the_dem_is_named(tmp_path: Path, fill: str, told: str) -> None:
+    """One photo of many is 900 m west of the DEM."""
+    scenes = photos_and_dem(tmp_path, near=300_000.0, far=299_100.0)
     with pytest.raises(CoverageError, match=f"image far: .*{told}") as error:
         orthos_of_blocks.on_one_grid(scenes, open_dem(tmp_path / "dem.tif", "ellipsoid", fill=fill), OutputOptions())
     assert str(error.value.remedy).endswith("; or leave this image out")
@@ -97,12 +103,7 @@ def test_an_image_outside_the_dem_is_named(tmp_path: Path, fill: str, told: str)
 
 def test_all_images_outside_the_dem_are_named(tmp_path: Path) -> None:
     """Two photos of three are west of the DEM: both have to be left out, so both are named at once."""
-    write_dem(tmp_path / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")
-    scenes = {}
-    for name, x in (("far", 299_100.0), ("near", 300_000.0), ("farther", 299_000.0)):
-        interior = Interior(600, 400, 0.006, 1e-5, 1e-5)
-        model = FrameCamera.from_map(interior, "EPSG:32651", [x, 2.7e6, 180.0, 0, 0, 0], frame="map", heights=(0, 100))
-        scenes[name] = Scene("frame", name, 600, 400, {"frame": model}, "table")
+    scenes = photos_and_dem(tmp_path, far=299_100.0, near=300_000.0, farther=299_000.0)
     with pytest.raises(CoverageError, match=r"image far: .*no pixels\. .* either: farther") as error:
         orthos_of_blocks.on_one_grid(scenes, open_dem(tmp_path / "dem.tif", "ellipsoid", fill="mask"), OutputOptions())
     assert str(error.value.remedy).endswith("; or leave these images out")
@@ -110,12 +111,7 @@ def test_all_images_outside_the_dem_are_named(tmp_path: Path) -> None:
 
 def test_with_masks_the_other_images_get_orthos(tmp_path: Path) -> None:
     """One photo of two is west of the DEM: it has no ortho, and a notice."""
-    write_dem(tmp_path / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")
-    scenes = {}
-    for name, x in (("far", 299_100.0), ("near", 300_000.0)):
-        interior = Interior(600, 400, 0.006, 1e-5, 1e-5)
-        model = FrameCamera.from_map(interior, "EPSG:32651", [x, 2.7e6, 180.0, 0, 0, 0], frame="map", heights=(0, 100))
-        scenes[name] = Scene("frame", name, 600, 400, {"frame": model}, "table")
+    scenes = photos_and_dem(tmp_path, far=299_100.0, near=300_000.0)
     fit: Any = SimpleNamespace(heights=None)
 
     def plan(fill: str, of: dict[str, Scene] = scenes) -> orthos_of_blocks.OrthoPlan:
