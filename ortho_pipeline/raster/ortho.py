@@ -31,6 +31,7 @@ from ortho_pipeline.raster.verified_writing import (
     retire_attached,
 )
 from ortho_pipeline.runtime.process_limits import Progress, claim_gdal_threads
+from ortho_pipeline.runtime.signals import called_by_gdal
 
 #: Bytes up to which a raster that is going to be copied is kept in memory instead of in a file.
 _SMALL = 16_000_000
@@ -364,23 +365,18 @@ class RasterWriter:
             if self.driver == "COG":
                 source = source or gdal.OpenEx(str(self._work), gdal.OF_RASTER, allowed_drivers=["GTiff"])
                 options = [f"{k}={v}" for k, v in self.options.items()]
-                advance = None if self._progress is None else self._advance
-                close(
-                    gdal.GetDriverByName("COG").CreateCopy(
-                        str(self._temporary), source, options=options, callback=advance
-                    )
-                )
+                driver, place = gdal.GetDriverByName("COG"), str(self._temporary)
+                with called_by_gdal(self._advance) as advance:
+                    close(driver.CreateCopy(place, source, options=options, callback=advance))
             self._dataset = None
         # GDAL omits empty blocks of a file larger than 4 GB.
         partly = self._written < self.grid.width * self.grid.height
         sparse = partly or self.options.get("SPARSE_OK", "NO").upper() in ("YES", "TRUE", "ON")
         check_written(self._temporary, self.path, size=(self.grid.width, self.grid.height), sparse=sparse)
 
-    def _advance(self, share: float, *_: Any) -> int:
-        """Report GDAL's progress, and continue."""
-        assert self._progress is not None
-        self._progress("Writing the COG", share)
-        return 1
+    def _advance(self, share: float) -> None:
+        if self._progress is not None:
+            self._progress("Writing the COG", share)
 
     def scratch(self, name: str) -> Path:
         """Return the path of a temporary raster next to the output; it is removed together with that of the output."""

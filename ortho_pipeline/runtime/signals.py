@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from typing import Any
 
 #: Signals that end a command; Windows has one of them.
@@ -44,6 +45,37 @@ def ended_by_signals() -> Iterator[None]:
         if hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0.0)
         sys.unraisablehook = before
+
+
+@contextlib.contextmanager
+def called_by_gdal(report: Callable[[float], object]) -> Iterator[Callable[..., int]]:
+    """Yield a progress function for GDAL, which ends its work at a signal or an error; the block raises it then.
+
+    GDAL prints and drops an exception of such a function, and says that it could not write.
+    """
+    came, errors, before = list[int](), list[BaseException](), dict[int, Any]()
+
+    def advance(share: float, *_: Any) -> int:
+        try:
+            report(share)
+        except BaseException as error:
+            errors.append(error)
+        return not (came or errors)
+
+    # Only the main thread may set what signals do, and only there they raise.
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, *_ENDING):
+            if signal.getsignal(number) in (signal.default_int_handler, _end):
+                before[number] = signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield advance
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came:
+            before[number](number, None)
+        if errors:
+            raise errors[0]
 
 
 def _end(number: int, _: Any) -> None:

@@ -40,6 +40,7 @@ from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.pixel_types import gdal_type
 from ortho_pipeline.raster.source import Grid, first_line
 from ortho_pipeline.raster.verified_writing import gdal_errors, written
+from ortho_pipeline.runtime.signals import called_by_gdal
 from ortho_pipeline.surface.base import Excerpt, Surface
 from ortho_pipeline.warp.job import WARPING, WarpJob, WarpRecord
 from ortho_pipeline.warp.quality.hiding import Hiding
@@ -380,25 +381,25 @@ def _warp_exactly(
     view: gdal.Dataset, ortho: gdal.Dataset, job: WarpJob, profile: Profile, transformer: Transformer, threads: int
 ) -> None:
     progress = job.resources.progress
-    callback = None if progress is None else (lambda share, *_: progress(WARPING, share) or 1)
     # Without the first two the values depend on how the warper cuts the image into chunks; the next two let it find
     # the window of a chunk in the image from points all over it, because terrain moves them.
     settings = ["XSCALE=1", "YSCALE=1", "SAMPLE_GRID=YES", "SAMPLE_STEPS=101", "SOURCE_EXTRA=32"]
-    gdal.Warp(
-        ortho,
-        view,
-        transformerOptions=list(transformer.options),
-        errorThreshold=0,
-        resampleAlg=job.resampling,
-        # By itself the warper clamps the source to the type of the output before it interpolates.
-        workingType=gdal_type(job.source.dtype),
-        dstNodata=profile.nodata,
-        multithread=threads > 1,
-        warpMemoryLimit=job.resources.memory // 2,
-        warpOptions=[
-            *settings,
-            f"NUM_THREADS={threads}",
-            "INIT_DEST=0" if profile.nodata is None else "INIT_DEST=NO_DATA",
-        ],
-        callback=callback,
-    )
+    with called_by_gdal(lambda share: progress and progress(WARPING, share)) as advance:
+        gdal.Warp(
+            ortho,
+            view,
+            transformerOptions=list(transformer.options),
+            errorThreshold=0,
+            resampleAlg=job.resampling,
+            # By itself the warper clamps the source to the type of the output before it interpolates.
+            workingType=gdal_type(job.source.dtype),
+            dstNodata=profile.nodata,
+            multithread=threads > 1,
+            warpMemoryLimit=job.resources.memory // 2,
+            warpOptions=[
+                *settings,
+                f"NUM_THREADS={threads}",
+                "INIT_DEST=0" if profile.nodata is None else "INIT_DEST=NO_DATA",
+            ],
+            callback=advance,
+        )
