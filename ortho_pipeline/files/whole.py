@@ -429,7 +429,8 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     '[]'
     """
     with whole_or_nothing(path, side_cars=False) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # Half characters stand for the bytes of a file name that is not UTF-8.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: str | os.PathLike[str], document: Any, *, ascii_only: bool = True) -> None:

@@ -605,6 +605,17 @@ def test_a_failing_scene_does_not_stop_the_others(block):
     assert [event["status"] for event in events if event["event"] == "scene"][:3] == ["done", "failed", "done"]
 
 
+def test_a_folder_name_that_is_not_utf8_fails_its_scene_and_not_the_page_of_the_run(block):
+    folder = block.folder / os.fsdecode(b"raw/\xff")
+    folder.mkdir()
+    for number in (1, 2):
+        os.rename(block.folder / f"raw/s{number}.tif", folder / f"s{number}.tif")
+    block.write(FILE.replace("raw/*", "raw/**/*"))
+    done = ortho("run", block.file, "--executor", "sequential")
+    assert (done.exit_code, "not UTF-8" in done.output) == (3, True), done.output
+    assert "raw/\\udcff/s2.tif" in (block.out / "index.html").read_text()
+
+
 def test_all_failed_and_missing_images_and_wrong_files(block):
     block.write(FILE.replace("images: raw/*.tif", "image: raw/none.tif"))
     done = ortho("run", block.file, "--executor", "sequential")
