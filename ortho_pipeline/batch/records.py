@@ -166,7 +166,7 @@ class RunRecord(Record):
         except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None
         # What is outside of the scene's folder is not ours to judge, or to remove.
-        inside = all(Path(state.path).name == state.path and state.path for state in record.outputs)
+        inside = all(Path(state.path).name == state.path not in ("", "..") for state in record.outputs)
         complete = not record.facts or {state.role for state in record.outputs} >= _OUTPUTS
         return record if inside and complete else None
 

@@ -40,6 +40,7 @@ from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import allowed, append_line, clear_up, confined, read_json, retire, together, write_json
+from ortho_pipeline.files.folders import is_removable
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
@@ -174,7 +175,8 @@ def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ..
 
 def _remove(folder: Path, names: set[str]) -> None:
     for name in names:
-        (folder / name).unlink(missing_ok=True)
+        if is_removable(folder / name):
+            (folder / name).unlink(missing_ok=True)
 
 
 def _facts(report: Mapping[str, Any]) -> dict[str, Any]:

@@ -148,6 +148,11 @@ def _state(folder: str | os.PathLike[str]) -> _State:
     return stat.st_dev, stat.st_ino, stat.st_ctime_ns, stat.st_mtime_ns
 
 
+def is_removable(path: str | os.PathLike[str]) -> bool:
+    """Return whether a path, which a record may state, is a file or a link, and can be one."""
+    return os.path.isfile(path) or os.path.islink(path)
+
+
 def require_replaceable(path: Path) -> None:
     """Refuse an output in place of a device, or of a file that only its owner may replace.
 

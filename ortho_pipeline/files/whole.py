@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.folders import require_replaceable
+from ortho_pipeline.files.folders import is_removable, require_replaceable
 from ortho_pipeline.files.locks import Lock
 from ortho_pipeline.files.reading import read_bounded
 
@@ -217,7 +217,7 @@ class Outputs:
 
     def commit(self) -> None:
         """Give all files their names, and remove those that no longer belong to them."""
-        obsolete = [path for path in self.obsolete if path not in self.staged and os.path.lexists(path)]
+        obsolete = [path for path in self.obsolete if path not in self.staged and is_removable(path)]
         renames = [(temporary.name, final.name) for final, temporary in self.staged.items()]
         try:
             if len(renames) + len(obsolete) > 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -212,6 +213,29 @@ def test_a_mosaic_that_is_no_longer_in_the_file_is_removed(block: Block) -> None
     assert mosaic_files(block) == sorted([*MOSAIC, own.name])
     assert block.run() == UNCHANGED
     assert mosaic_files(block) == [own.name]
+
+
+def test_a_record_that_names_what_is_no_file_stops_no_run(block: Block) -> None:
+    def tamper(path: Path) -> None:
+        document = json.loads(path.read_text())
+        for name in ("notes", "a\0b", "x" * 300):
+            document["outputs"].append({**document["outputs"][0], "role": "more", "path": name})
+        path.write_text(json.dumps(document))
+
+    out = block.folder / "out"
+    block.write(FILE.replace("- images: raw/*.tif", "- image: raw/s0.tif") + "mosaic: {}\n")
+    block.run()
+    for folder in (out, out / "s0"):
+        (folder / "notes").mkdir()
+    tamper(out / ".run" / "s0.json")
+    tamper(out / ".run" / "mosaic" / "record.json")
+    assert block.run() == {"s0": "done"}
+    assert "error" not in json.loads((out / "run.json").read_text())["mosaic"]
+    tamper(out / ".run" / "mosaic" / "record.json")
+    block.write(FILE.replace("- images: raw/*.tif", "- image: raw/s0.tif"))
+    assert block.run() == {"s0": "unchanged"}
+    assert not (out / "mosaic.vrt").exists()
+    assert (out / "notes").is_dir()
 
 
 def test_options_of_matching_without_a_reference_are_refused_by_a_second_run_too(block: Block) -> None:

@@ -339,6 +339,7 @@ HOSTILE = [
     _scene(status=7), _scene(facts={"lean_m_per_m": "x"}), _scene(status="failed", error={}),
     _scene(status="failed", error={"message": ["\u001b"]}), _scene(outputs=[_OUTSIDE]), _scene(inputs=[{"path": None}]),
     _scene().replace(b'"key"', b'"seconds": 1e999, "key"'), _scene(inputs={}),
+    _scene(outputs=[_OUTSIDE | {"path": ".."}]),
 ]  # fmt: skip
 
 
