@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import multiprocessing
 import os
 import signal
@@ -27,6 +28,7 @@ from ortho_pipeline.options import EXECUTORS
 from ortho_pipeline.runtime.process_limits import print_no_error_twice, require_memory, startable_threads
 from ortho_pipeline.runtime.signals import Terminated, ended_by_signals
 
+_log = logging.getLogger(__name__)
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
 _AHEAD = 256
 #: Seconds of work that travel together to a scheduler, and at most so many jobs.
@@ -201,7 +203,7 @@ class InGroups:
                     return
                 for future in [future for future in waiting if future.done()]:
                     group, answers = waiting.pop(future), answers + 1
-                    if future.exception() is None:
+                    if _error_of(future) is None:
                         took, futures = future.result()
                         seconds.append(took)
                         rest.extend(group[len(futures) :])
@@ -377,7 +379,7 @@ def _completed(
             if ended.done():
                 return
             for future in [future for future in waiting if future.done()]:
-                broken = broken or isinstance(future.exception(), BrokenExecutor)
+                broken = broken or isinstance(_error_of(future), BrokenExecutor)
                 yield waiting.pop(future), future
     finally:
         for future in waiting:
@@ -391,6 +393,23 @@ def _submitted(executor: Executor, work: Callable[[Job], Outcome], job: Job) -> 
         failed: Future[Outcome] = Future()
         failed.set_exception(error)
         return failed
+
+
+def _error_of(future: Future[Any]) -> BaseException | None:
+    """Return the exception of a finished future.
+
+    Raises
+    ------
+    OrthoError
+        If the executor has cancelled it.
+    """
+    if future.cancelled():
+        raise OrthoError(
+            "the executor cancelled the work, as dask does when its scheduler ends",
+            field="scheduler",
+            remedy="start the scheduler, then run again: what is finished is kept",
+        )
+    return future.exception()
 
 
 def _died(future: Future[Outcome]) -> Future[Outcome]:
@@ -457,7 +476,10 @@ def crew_of(
             )
         client, pool = dask_executor(scheduler)
         with client:
-            yield InGroups(pool, sum(client.nthreads().values())), threads or 1
+            slots = sum(client.nthreads().values())
+            if not slots:
+                _log.warning("The dask scheduler at %s has no workers. Waiting for a worker.", scheduler)
+            yield InGroups(pool, slots), threads or 1
     elif executor == "sequential":
         yield Sequential(), threads
     elif executor in ("processes", None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -11,7 +12,7 @@ import shutil
 import signal
 import time
 from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,9 @@ from osgeo import gdal
 
 from ortho_pipeline.batch import executors
 from ortho_pipeline.batch import runner as batch
-from ortho_pipeline.batch.executors import InGroups, WorkerDied, completed
+from ortho_pipeline.batch.executors import InGroups, WorkerDied, completed, crew_of
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 
 distributed = pytest.importorskip("distributed")
@@ -206,3 +207,30 @@ def test_of_a_group_that_is_lost_only_the_job_that_loses_it_has_failed() -> None
         assert sorted(future.result() for future in found.values()) == [
             float(job) for job in range(3000) if job != 2000
         ]
+
+
+class Ended(Executor):
+    """Cancels its work, as dask does when its scheduler ends."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        cancelled: Future[Any] = Future()
+        cancelled.cancel()
+        cancelled.set_running_or_notify_cancel()
+        return cancelled
+
+
+@pytest.mark.parametrize("crew", [InGroups(Ended()), Ended()])
+def test_a_scheduler_that_ends_is_an_error_with_a_remedy(crew: Any) -> None:
+    with pytest.raises(OrthoError, match="its scheduler ends") as caught:
+        list(completed(crew, float, range(3)))
+    assert "run again" in str(caught.value.remedy)
+
+
+def test_a_scheduler_without_workers_is_said(monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
+    class Client(contextlib.nullcontext[None]):
+        def nthreads(self) -> dict[str, int]:
+            return {}
+
+    monkeypatch.setattr(executors, "dask_executor", lambda scheduler: (Client(), Ended()))
+    with crew_of("dask", None, None, "tcp://host:8786", 1):
+        assert "tcp://host:8786 has no workers" in caplog.text
