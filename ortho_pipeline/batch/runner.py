@@ -7,6 +7,7 @@ continues where it stopped, and its outputs have the same bytes as those of an u
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import time
@@ -49,6 +50,8 @@ from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
 #: The record of the mosaic within the output folder.
 MOSAIC_RECORD = Path(STATE, "mosaic", "record.json")
+#: The lock of a run within the output folder.
+_RUN_LOCK = Path(STATE, "run.lock")
 #: A larger file is not a report on a mosaic.
 _REPORT_BYTES = 50_000_000
 #: Seams from which on they are measured by several processes.
@@ -257,7 +260,7 @@ def run(
             ready = for_run(planned.chosen(only), _run_id(), memory, budget, allow_network=allow_network)
             own = [job for job in ready if job.name in {chosen.name for chosen in jobs}]
             return run_shared(replace(planned, jobs=tuple(ready)), own, store, crew, make_scene, progress)
-    lock = planned.output / STATE / "run.lock"
+    lock = planned.output / _RUN_LOCK
     with (
         confined(planned.output),
         locked(lock, shared=part, owner=f"'ortho run {planned.path.name}'"),
@@ -309,7 +312,7 @@ class _Run:
         self.log("run started", scenes=len(jobs), file=str(self.planned.path), versions=versions())
         try:
             changed = list(self._without_unchanged(jobs))
-            work = _with_checksums if self.checksums else make_scene
+            work = functools.partial(_make_in_run, checksums=self.checksums)
             for job, future in completed(crew, work, changed):
                 self._note(_outcome(job, future), len(jobs))
             mosaic = None if self.part else self._mosaic(crew, jobs)
@@ -467,10 +470,19 @@ class _Mosaic:
         return [overlaps[id(pair)] for pair in pairs]
 
 
-def _with_checksums(job: Job) -> Outcome:
-    # A process of the caller, or of a cluster, may know checksums of earlier runs.
-    DIGESTS.renew(job.run)
-    return make_scene(job, checksums=True)
+def _make_in_run(job: Job, checksums: bool) -> Outcome:
+    # A worker on another machine may have a folder of its own at this path.
+    if not (job.output / _RUN_LOCK).is_file():
+        raise InputError(
+            "this worker does not have the output folder of the run",
+            file=job.output,
+            field="output",
+            remedy="share one folder, at the same path, with all workers",
+        )
+    if checksums:
+        # A process of the caller, or of a cluster, may know checksums of earlier runs.
+        DIGESTS.renew(job.run)
+    return make_scene(job, checksums)
 
 
 def _outcome(job: Job, future: Future[Outcome]) -> Outcome:

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -505,6 +505,24 @@ def test_a_worker_with_other_software_refuses(block, monkeypatch):
     outcome = batch.make_scene(job)
     assert outcome.status == "failed"
     assert "gdal 1.0 instead of" in outcome.error["message"]
+
+
+def test_a_worker_with_an_output_folder_of_its_own_makes_nothing(block):
+    """A folder of another machine at the same path: here the folder is moved away while the worker works."""
+
+    class Elsewhere(ThreadPoolExecutor):
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
+            block.out.rename(block.folder / "shared")
+            future = super().submit(fn, *args, **kwargs)
+            wait([future])
+            assert not block.out.exists()
+            (block.folder / "shared").rename(block.out)
+            return future
+
+    with Elsewhere(1) as pool:
+        result = batch.run(block.file, executor=pool)
+    assert states(result) == {"s0": "failed", "s1": "failed", "s2": "failed"}
+    assert "does not have the output folder of the run" in result.scenes[0].error["message"]
 
 
 def test_checksums_see_what_dates_hide(block):
