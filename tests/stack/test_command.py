@@ -275,7 +275,13 @@ def test_a_changed_source_or_side_car_is_matched_again(made, tmp_path, counted):
 def test_orthos_that_are_no_part_of_the_result_go(made, tmp_path):
     output = OutputOptions(resampling="cubic", threads=1, format="GTiff", stac=True)
     run(made[0], tmp_path / "out", output=output)
+    # A record that others wrote does not choose what is removed.
+    mine, record = tmp_path / "out" / "aligned" / "mine.tif", next((tmp_path / "out" / "aligned").glob("*.record.json"))
+    mine.write_text("of the user")
+    mine.with_name("x.record.json").write_text(re.sub(r"\w+_aligned\.tif", "mine.tif", record.read_text()))
     run(made[0][:3], tmp_path / "out")
+    assert mine.read_text() == "of the user"
+    mine.unlink()
     endings = "_aligned.tif", "_model.json", ".record.json"
     left = {path.name for path in (tmp_path / "out" / "aligned").iterdir() if path.is_file()}
     assert left == {f"{path.stem}{ending}" for path in made[0][:3] for ending in endings}

@@ -236,6 +236,7 @@ def test_a_record_is_that_of_a_set_only_with_its_outputs(tmp_path: Path) -> None
     failed = RunRecord(name="pair", key=near.key, status="failed", error={"message": "cannot match"})
     assert near.is_in(failed)
     assert not near.is_in(failed.replaced(status="done"))
+    assert not near.is_in(failed.replaced(name="../pair"))
     state = FileState(role="image", path="s3://bucket/a.tif", bytes=1, mtime_ns=0, sha256="0" * 64, tag="1")
     far = replace(near, inputs=(state,))
     assert not far.is_in(failed.replaced(key=far.key, inputs=far.inputs))

@@ -65,7 +65,7 @@ class FileSet:
 
     def is_in(self, record: RunRecord) -> bool:
         """Return whether a record is that of this set; a failure with far files may have been one of access."""
-        if record.key != self.key:
+        if (record.name, record.key) != (self.name, self.key):
             return False
         if record.status == "done":
             return {state.path for state in record.outputs} == set(self.files.values())
@@ -130,7 +130,7 @@ class RecordedFolder:
 
     def learn(self, name: str) -> None:
         """Learn the checksums of inputs that the record of a set states."""
-        record = None if self.rebuild or self.is_far else RunRecord.at(Path(self.place) / _record_of(name))
+        record = None if self.rebuild or self.is_far else RunRecord.at(Path(self.place) / record_file(name))
         if record is not None:
             DIGESTS.learn(record.inputs)
 
@@ -164,13 +164,13 @@ class RecordedFolder:
         left, folder = [], Path(self.place)
         for one in sets:
             # Another worker may be writing it: this only reads.
-            record = None if self.is_far or self.rebuild else RunRecord.at(folder / _record_of(one.name))
+            record = None if self.is_far or self.rebuild else RunRecord.at(folder / record_file(one.name))
             kept = self._valid(one, record)
             if kept is None:
                 left.append(one)
             else:
                 # A command that was killed after its last rename has left a lock; another worker may hold it.
-                for name in (_record_of(one.name), *one.files.values()):
+                for name in (record_file(one.name), *one.files.values()):
                     with contextlib.suppress(InputError):
                         clear_up(folder / name)
                 note(one.name, Made(kept, True))
@@ -196,13 +196,13 @@ class RecordedFolder:
                 if kept is not None:
                     return Made(kept, True)
                 record = one.made(folder)
-                record.write(folder / _record_of(one.name))
+                record.write(folder / record_file(one.name))
                 return Made(record, False)
 
     def _kept(self, one: FileSet) -> RunRecord | None:
         folder = Path(self.place)
         files = [folder / name for name in one.files.values()]
-        return self._valid(one, recorded_at(folder / _record_of(one.name), *files, rebuild=self.rebuild))
+        return self._valid(one, recorded_at(folder / record_file(one.name), *files, rebuild=self.rebuild))
 
     def _valid(self, one: FileSet, record: RunRecord | None) -> RunRecord | None:
         """Return a record on this machine if it is that of a set, and the files are as it states."""
@@ -210,7 +210,7 @@ class RecordedFolder:
 
     def _make_far(self, one: FileSet) -> Made:
         """Make the files on this machine and upload them; the record is removed first and written last."""
-        store, name = self.store, _record_of(one.name)
+        store, name = self.store, record_file(one.name)
         record = None if self.rebuild else _record_in(store, name)
         if record is not None and one.is_in(record) and not change_in_store(store, record):
             return Made(record, True)
@@ -238,17 +238,17 @@ class RecordedFolder:
             return []
         known, there = {key_of_name(name) for name in names}, self.names()
         found = sorted(path.name.removesuffix(".lock") for path in (Path(self.place) / STATE).glob("*.lock"))
-        return [name for name in found if key_of_name(name) not in known and _record_of(name) not in there]
+        return [name for name in found if key_of_name(name) not in known and record_file(name) not in there]
 
-    def others(self, names: Iterable[str]) -> dict[str, list[str]]:
-        """Return the files of recorded sets that have none of some names, by name of set; the record is the last."""
-        known, found = {key_of_name(_record_of(name)) for name in names}, {}
+    def others(self, names: Iterable[str]) -> list[str]:
+        """Return the names of recorded sets other than some."""
+        known, found = {key_of_name(record_file(name)) for name in names}, []
         for name in sorted(self.names()):
             if not name.endswith(_RECORD) or key_of_name(name) in known:
                 continue
             record = _record_in(self.store, name) if self.is_far else RunRecord.at(Path(self.place) / name)
             if record is not None:
-                found[name.removesuffix(_RECORD)] = [*(state.path for state in record.outputs), name]
+                found.append(name.removesuffix(_RECORD))
         return found
 
     @contextlib.contextmanager
@@ -279,7 +279,8 @@ def recorded_in(folder: str | os.PathLike[str], name: str, allow_network: bool, 
     return RecordedFolder(place, allow_network, rebuild)
 
 
-def _record_of(name: str) -> str:
+def record_file(name: str) -> str:
+    """Return the name of the record of a set."""
     return f"{name}{_RECORD}"
 
 

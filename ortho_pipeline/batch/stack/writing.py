@@ -14,7 +14,7 @@ from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.dates import Dated, RawScene
 from ortho_pipeline.batch.stack.placing import Placed, geotransform_of
 from ortho_pipeline.batch.stack.raw import corrected_model, write_in, written_with
-from ortho_pipeline.batch.stack.recorded import FileSet, RecordedFolder
+from ortho_pipeline.batch.stack.recorded import FileSet, RecordedFolder, record_file
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.commands.orthos.resampling import write_resampled
 from ortho_pipeline.commands.placement import Placement
@@ -32,6 +32,8 @@ from ortho_pipeline.raster.source import Grid, open_dataset
 _log = logging.getLogger(__name__)
 #: How the names of corrected images end.
 _TIF, _VRT = "_aligned.tif", "_aligned.vrt"
+#: How the names of all files of a date end.
+_WRITTEN = _TIF, _VRT, "_model.json"
 #: Writes the image of a date with a name into a folder.
 WriteImage = Callable[[str, Path], None]
 
@@ -79,10 +81,12 @@ class Writer:
     def _outdated(self, sets: Sequence[FileSet]) -> list[str]:
         """Return the names of files of dates that are not in the result."""
         found: list[str] = []
-        for name, files in self.folder.others(one.name for one in sets).items():
-            found += [f"{name}_stac.json", f"{name}_delivery.json", *files]
+        for name in self.folder.others(one.name for one in sets):
+            # The record itself does not decide what is removed: others may have written it.
+            endings = "_stac.json", "_delivery.json", *_WRITTEN
+            found += [*(f"{name}{end}" for end in endings), record_file(name)]
         for name in self.folder.begun(one.name for one in sets):
-            files = [f"{name}{end}" for end in (_TIF, _VRT, "_model.json")]
+            files = [f"{name}{end}" for end in _WRITTEN]
             for file in files:
                 clear_up(Path(self.folder.place) / file)
             found += files
