@@ -15,7 +15,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_frame.pose import Pose, Shot
-from ortho_frame.projects import MAP, ProjectAxes, orthority_of, reconstruction_of, shot_in
+from ortho_frame.projects import MAP, ProjectAxes, on_map, orthority_of, reconstruction_of, shot_in
 from ortho_frame.tables import is_orthority, is_reconstruction, read_camera, read_exterior
 from ortho_pipeline.plugin import (
     LOOKS_PAST,
@@ -70,14 +70,14 @@ def ortho_sensors() -> Iterable[Sensor]:
     yield Sensor(
         "odm",
         "photos of an OpenDroneMap or OpenSfM project (images next to opensfm/reconstruction.json)",
-        lambda dataset: reconstruction_of(dataset.GetDescription()) is not None,
+        lambda dataset: not on_map(dataset) and reconstruction_of(dataset.GetDescription()) is not None,
         open_odm,
         options=OPTIONS,
     )
     yield Sensor(
         "orthority",
         "frames with orthority's files next to them: *int_param*.yaml and *ext_param*.geojson",
-        lambda dataset: orthority_of(dataset.GetDescription()) is not None,
+        lambda dataset: not on_map(dataset) and orthority_of(dataset.GetDescription()) is not None,
         open_orthority,
         options=OPTIONS,
     )

@@ -54,6 +54,12 @@ class ProjectAxes:
     corner: tuple[float, float] | None = None
 
 
+def on_map(dataset: Any) -> bool:
+    """Return whether a raster is upright on a map grid, as a project's orthophoto and surface models are."""
+    grid = dataset.GetGeoTransform(can_return_null=True)
+    return bool(dataset.GetProjection()) and grid is not None and grid[2] == grid[4] == 0.0
+
+
 def reconstruction_of(name: str) -> Path | None:
     """Return the reconstruction of the OpenDroneMap or OpenSfM project that an image belongs to; None without."""
     if not name:

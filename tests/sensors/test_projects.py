@@ -13,6 +13,7 @@ from osgeo import gdal
 from photos import photo
 from scipy.spatial.transform import Rotation
 
+from ortho_pipeline import commands
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
@@ -268,3 +269,17 @@ def test_odm_photos_open_along_the_axes_of_utm(real):
         by_tags = ground_transform("EPSG:4979", "EPSG:32651")([tags.model.perspective_centre])[0]
         # RTK positions, and those that OpenDroneMap adjusted with them.
         np.testing.assert_allclose(scene.model.perspective_centre, by_tags, atol=0.06)
+
+
+@pytest.mark.parametrize("folder", ["odm_orthophoto", "images"])
+def test_the_orthophoto_of_a_project_is_a_finished_ortho(tmp_path, folder):
+    project(tmp_path, offset=False)
+    (tmp_path / folder).mkdir(exist_ok=True)
+    place = tmp_path / folder / "odm_orthophoto.tif"
+    ortho = gdal.GetDriverByName("GTiff").Create(str(place), 60, 40)
+    ortho.SetProjection("EPSG:32636")
+    ortho.SetGeoTransform((5e5, 1.0, 0.0, 43e5, 0.0, -1.0))
+    ortho = None
+    assert commands.info(place)["kind"] == "map image"
+    assert open_scene(place, SceneOptions(ortho=True)).sensor == "ortho"
+    assert commands.info(tmp_path / "images" / "one.tif")["sensor"] == "odm"
