@@ -181,6 +181,17 @@ def test_the_only_dem_belongs_to_all_scenes_wherever_it_lies(folder):
     assert survey(folder).beside("scene.tif", "dem") == []
 
 
+def test_the_only_points_belong_to_the_only_scene_wherever_they_lie(folder):
+    for name, place in {"scene.tif": "raw", "scene_RPC.TXT": "raw", "gcps.csv": "points"}.items():
+        (folder / place).mkdir(exist_ok=True)
+        shutil.move(folder / name, folder / place / name)
+    assert f"--gcps {folder / 'points' / 'gcps.csv'}" in run("info", folder).stdout
+    assert 'points: {gcps: "points/gcps.csv"}' in text(survey(folder))
+    shutil.copytree(folder / "raw", folder / "later")
+    assert survey(folder).beside("raw/scene.tif", "points") == []
+    assert "No control points found for later/scene.tif." in run("info", folder).stdout
+
+
 @pytest.mark.parametrize(
     ("words", "meant"),
     [

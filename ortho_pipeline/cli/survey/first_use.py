@@ -166,8 +166,8 @@ def next_steps(seen: FolderSurvey) -> list[str]:
     notes, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
     if not dems:
         notes.append(
-            "No DEM found. '--dem auto --allow-network' downloads the Copernicus DEM under the scene. Or use "
-            "'--dem FILE', or '--height M' for flat ground."
+            f"No DEM found for {scenes[0]}. '--dem auto --allow-network' downloads the Copernicus DEM under the scene. "
+            "Or use '--dem FILE', or '--height M' for flat ground."
         )
     elif any(entry.path == dems[0] and entry.said.endswith(NO_DATUM) for entry in seen.found):
         notes.append(
@@ -178,11 +178,11 @@ def next_steps(seen: FolderSurvey) -> list[str]:
         words += ["--gcps", at(points[0])]
     elif maps:
         words += ["--reference", at(maps[0])]
-        notes.append(f"No control points found. The command below matches them with {maps[0]}.")
+        notes.append(f"No control points found for {scenes[0]}. The command below matches them with {maps[0]}.")
     else:
         notes.append(
-            "No control points found. The ortho will be as accurate as the delivered model. To improve it, add "
-            "measured points ('--gcps FILE') or an ortho of the same place ('--reference ORTHO')."
+            f"No control points found for {scenes[0]}. The ortho will be as accurate as the delivered model. "
+            "To improve it, add measured points ('--gcps FILE') or an ortho of the same place ('--reference ORTHO')."
         )
     if len(scenes) == 1:
         return [*notes, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
@@ -190,7 +190,8 @@ def next_steps(seen: FolderSurvey) -> list[str]:
     if len(frames) == len(scenes) and not points:
         line = shlex.join(["ortho", "adjust", str(seen.folder), "--ties", "auto", *words, "--orthos", "-o", "out"])
         return [*notes, f"Adjust the {len(scenes)} photos together, and make their orthos:", f"  {line}"]
-    file, network = at("pipeline.yaml"), [] if dems else ["--allow-network"]
+    file = at("pipeline.yaml")
+    network = [] if all(seen.beside(name, "dem") for name in scenes) else ["--allow-network"]
     lines = [
         shlex.join(words)
         for words in (

@@ -91,8 +91,9 @@ class FolderSurvey:
         """Return the files of a kind that belong to a scene: named after it, in its folder, or above it.
 
         What bears another scene's name is that one's; what lies in a folder above belongs to the scenes of that folder
-        if it has some. The only DEM of the delivery, in a folder without scenes, belongs to all. Points of which most
-        are outside of an image were measured in another one, such as the pan image of a bundle.
+        if it has some. The only DEM of the delivery, in a folder without scenes, belongs to all; what there is only one
+        of belongs to the only scene. Points of which most are outside of an image were measured in another one, such as
+        the pan image of a bundle.
         """
         reach = {file.path: file.reach for file in self.found}
         mine, others = Path(scene).stem, {Path(name).stem for name in self.of("scene")} - {Path(scene).stem}
@@ -104,7 +105,9 @@ class FolderSurvey:
                 return named
             if free := [name for name in here if not any(Path(name).stem.startswith(other) for other in others)]:
                 return free
-        only = self.of(kind) if kind == "dem" else []
+        only = [name for name in self.of(kind) if _fits(reach[name], reach[scene])]
+        if kind != "dem" and len(self.of("scene")) > 1:
+            return []
         alone = len(only) == 1 and not any(Path(name).parent == Path(only[0]).parent for name in self.of("scene"))
         return only if alone else []
 
