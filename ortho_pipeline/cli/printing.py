@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ortho_pipeline.cli.flags import as_typed, name_as_typed
+from ortho_pipeline.cli.flags import FLAGS, as_typed, name_as_typed, with_flags
 from ortho_pipeline.cli.machine.browser import page_of, show_page
 from ortho_pipeline.cli.machine.terminal import printable_json, say
 from ortho_pipeline.errors.texts import counted
@@ -260,11 +260,15 @@ def print_sensor_test(tested: Mapping[str, Any]) -> None:
 
 def print_comparison(result: CompareResult, units: str) -> None:
     """Print the recommendation of a comparison, then its table; `units` are ``px`` or ``m``."""
+    from ortho_pipeline.report.wording import option_of_choice
+
     compared, points = result.comparison, result.comparison.points
     wide = max([len(row.model) for row in compared.rows] + [5])
     axes = ("column", "row") if units == "px" else ("x", "y")
     reason = compared.recommendation.reason
     say(f"* Recommended: {reason}." if compared.recommended else f"No model is recommended: {reason}.")
+    if (option := option_of_choice(compared)) is not None:
+        say(f"  Next: use {with_flags(option, FLAGS)} in other commands, such as rectify.")
     print_notices({"warnings": compared.warnings, "notices": compared.notices})
     say(f"\n{counted(points.control, 'control point')}, {counted(points.check, 'check point')}; RMSE in {units}")
     say(

@@ -335,9 +335,8 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
             finished,
             "copy the other files of the delivery next to it, give an RPC file with ",
             Setting("scene.rpc", "FILE"),
-            ", or fit a model to control points with ",
-            Setting("points.fit_model", "NAME"),
-            " ('ortho compare' recommends one). To see which files a sensor needs and does not find, repeat with ",
+            ", or fit a model to control points ('ortho compare' recommends one). To see which files a "
+            "sensor needs and does not find, repeat with ",
             Setting("scene.sensor", "NAME"),
             hint,
         ),

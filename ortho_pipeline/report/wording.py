@@ -16,6 +16,7 @@ from ortho_pipeline.display.numbers import (
 )
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.blunders import contradicting
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.records import Adjustment, Rmse, RmseOnGround, RmsesOnGround
 from ortho_pipeline.models import families
 from ortho_pipeline.report.map_scale import PIXEL, POSITION, scale_text, usual_scale
@@ -216,11 +217,11 @@ def _on_ground(report: SceneReport, pixels: float) -> str:
     return "" if pixel is None else f" ({metres(pixels * math.sqrt(pixel[0] * pixel[1]))})"
 
 
-def option_of_choice(report: SceneReport) -> Text | None:
+def option_of_choice(comparison: ComparisonRecord | None) -> Text | None:
     """Return the option with which other commands use the recommended model."""
-    if report.comparison is None or report.comparison.recommendation.model is None:
+    if comparison is None or comparison.recommendation.model is None:
         return None
-    model = report.comparison.recommendation.model
+    model = comparison.recommendation.model
     if model in {family.name for family in families()}:
         return Text(Setting("points.fit_model", model))
     return Text(Setting("points.correction", model.partition("+")[2] or "none"))

@@ -105,6 +105,17 @@ def test_what_is_missing_is_named_with_the_ways_to_get_it(folder):
     assert "No image has a sensor model" in run("info", folder).stdout
 
 
+def test_an_image_without_a_model_gets_one_by_the_words_that_are_printed(folder):
+    (folder / "scene_RPC.TXT").unlink()
+    refused = run("info", folder / "scene.tif").stderr
+    assert "'ortho compare' recommends one" in refused
+    assert "`points." not in refused
+    words = folder / "scene.tif", "--gcps", folder / "gcps.csv"
+    said = run("compare", *words, "--models", "affine2d,affine3d").stdout
+    assert "  Next: use --fit-model affine3d in other commands" in said
+    assert run("fit", *words, "--fit-model", "affine3d").exit_code == 0
+
+
 def test_outputs_are_no_inputs(folder):
     shutil.copy(SAMPLE / "dem.tif", folder / "scene_ortho.tif")
     assert "scene_ortho.tif" in survey(folder).of("dem")

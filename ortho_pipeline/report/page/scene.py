@@ -79,7 +79,7 @@ def write_report_html(
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
         unsettled=unsettled(report),
         runner_up=runner_up(report),
-        option_of_choice=option_of_choice(report),
+        option_of_choice=option_of_choice(report.comparison),
         doubted=doubted(adjustment.notices) & {one.id for one in adjustment.points},
         of_fit=not adjustment.rmse.check and bool(adjustment.rmse.loo) and bool(adjustment.parameters),
         too_short=_too_short(report),
