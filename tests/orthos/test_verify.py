@@ -317,6 +317,19 @@ def test_map_coordinates_in_place_of_pixels_are_an_error(shifted, tmp_path):
     assert "give columns and rows of the ortho, not map coordinates" in " ".join(done.output.split())
 
 
+def test_points_measured_in_the_raw_scene_do_not_test_its_ortho(tiny, tmp_path):
+    """The sample scene had errors of 490 m, with an ASPRS class."""
+    points = "--gcps", tiny.gcps, "--points-crs", "EPSG:4979"
+    made = run("rectify", tiny.image, *points, "--height", 500, "-o", tmp_path / "out")
+    assert made.exit_code == 0, made.output
+    ortho = next((tmp_path / "out").glob("*_ortho.tif"))
+    refused = run("verify", ortho, *points)
+    assert refused.exit_code == 2
+    assert "measured in the raw scene, not in the ortho" in refused.stderr
+    next((tmp_path / "out").glob("*_report.json")).write_text("{}")
+    assert "measured in the raw scene" not in run("verify", ortho, *points).output
+
+
 def test_nothing_to_compare_with_is_an_error(shifted):
     done = run("verify", shifted[0])
     assert done.exit_code == 2
