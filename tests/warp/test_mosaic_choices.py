@@ -414,6 +414,19 @@ def test_the_command_writes_mosaic_record_and_page(tmp_path):
     assert json.loads((tmp_path / "m.json").read_text())["balance"] is None
 
 
+@pytest.mark.parametrize("name", ["mosaic", "mosaic.png", "mosaic.json"])
+def test_the_name_of_a_mosaic_says_its_format(tmp_path, name):
+    """A COG was written to mosaic.png."""
+    path = write(tmp_path, "a", GROUND[:80, :80], 0, 0).path
+    done = CliRunner().invoke(cli, ["mosaic", str(path), "-o", str(tmp_path / name)])
+    assert done.exit_code == 2
+    assert "a mosaic of the format COG needs a name that ends in .tif" in done.stderr
+    assert not (tmp_path / name).exists()
+    assert mosaic([path], tmp_path / "m.vrt").files["mosaic"].read_text().startswith("<VRTDataset")
+    with pytest.raises(InputError, match=r"ends in \.vrt"):
+        mosaic([path], tmp_path / "m.tif", MosaicOptions(format="VRT"))
+
+
 def test_what_cannot_be_is_refused(tmp_path):
     one, other = (write(tmp_path, name, GROUND[:80, :80], 40 * k, 0) for k, name in enumerate("ab"))
     paths = [one.path, other.path]

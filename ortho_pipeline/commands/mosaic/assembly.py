@@ -53,7 +53,7 @@ def mosaic(
     Parameters
     ----------
     path : path
-        Path of the mosaic; its record and page get the same name.
+        Path of the mosaic, which ends in .tif or .vrt; its record and page get the same name.
     allow_network : bool
         Allow addresses for orthos and mosaic; a VRT cannot have one.
 
@@ -75,11 +75,12 @@ def mosaic(
     150
     """
     paths = [place(located(ortho, allow_network=allow_network)) for ortho in listed_paths(orthos, "orthos")]
-    options, path = options or MosaicOptions(format="COG"), Path(path)
+    path = Path(path)
+    options = options or MosaicOptions(format="VRT" if path.suffix.lower() == ".vrt" else "COG")
     if options.format == "VRT":
         _refuse_far(paths, path)
     files = mosaic_files(path)
-    _check_paths(paths, files)
+    _check_paths(paths, files, options.format)
     layers = [_ortho(ortho, name) for ortho, name in zip(paths, _names(paths), strict=True)]
     ledger = Ledger(begun=states([*paths, *(ortho.accuracy for ortho in layers if ortho.accuracy)]))
     with together(path.parent, path.stem):
@@ -108,13 +109,14 @@ def _refuse_far(orthos: Sequence[Path], path: Path) -> None:
             )
 
 
-def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path]) -> None:
-    if len(set(files.values())) < len(files):
+def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path], file_format: str) -> None:
+    endings = {"VRT": (".vrt",)}.get(file_format, (".tif", ".tiff"))
+    if files["mosaic"].suffix.lower() not in endings:
         raise InputError(
-            "record (.json) and page (.html) need other names than the mosaic",
+            f"a mosaic of the format {file_format} needs a name that ends in {endings[0]}",
             file=files["mosaic"],
             field="output",
-            remedy="use a name that ends in .tif or .vrt",
+            remedy="use such a name; one that ends in .vrt makes a VRT",
         )
     known = [ortho.resolve() for ortho in orthos]
     for path in map(allowed, files.values()):
