@@ -19,11 +19,6 @@ def flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
         yield name, str(value)
 
 
-def _decimals(value: float) -> int:
-    """Return how many decimals show three digits of a value, at least two and at most five."""
-    return 2 if abs(value) >= 1 or value == 0 else min(5, 2 - math.floor(math.log10(abs(value))))
-
-
 def px(value: float) -> str:
     """Return pixels."""
     return f"{fixed(value)} px"
@@ -59,11 +54,16 @@ def class_size(centimetres: int) -> str:
 
 
 def fixed(value: float | None) -> str:
-    """Return a value with three digits."""
+    """Return a value with two significant digits, at least two decimals and at most four.
+
+    >>> fixed(12.345), fixed(0.19), fixed(0.0758), fixed(0.00148), fixed(0.0)
+    ('12.35', '0.19', '0.076', '0.0015', '0.00')
+    """
     if value is None:
         return "–"
-    # Below 1e-9 it is rounding, and "0.00" is not "0.00000".
-    return f"{value:.2f}" if abs(value) >= 0.1 or abs(value) < 1e-9 else f"{value:.{min(_decimals(value), 4)}f}"
+    # Below 1e-9 it is rounding, and "0.00" is not "0.0000".
+    size = abs(value)
+    return f"{value:.{2 if size >= 0.0995 or size < 1e-9 else 3 if size >= 0.00995 else 4}f}"
 
 
 def signed(value: float | None) -> str:
