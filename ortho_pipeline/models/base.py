@@ -199,7 +199,7 @@ class SensorModel(ABC):
     def param_partials(self, ground: ArrayLike) -> Array:
         """Return d(image)/d(params) as ``(N, 2, P)``, by central differences over 0.01 to 10 px if possible."""
         ground = as_ground(ground)
-        params = self.params
+        params = np.asarray(self.params, dtype=np.float64)  # a plugin may start from whole numbers
         partials = np.empty((len(ground), 2, len(params)))
         for k, value in enumerate(params):
             step = 1e-6 * max(abs(value), 1e-3)

@@ -301,6 +301,13 @@ def test_slopes_of_parameters_are_right_in_any_unit_and_at_zero(value, monkeypat
     check_sensor_model(Shifted(), ground)
 
 
+def test_slopes_are_right_of_parameters_that_start_as_whole_numbers():
+    model = Shifted((0, 0))
+    assert model.params.dtype.kind == "i"
+    ground = box_of(model, 20)
+    np.testing.assert_allclose(model.param_partials(ground), np.broadcast_to(np.eye(2) / 10, (20, 2, 2)), atol=1e-8)
+
+
 def test_a_point_at_a_seam_of_the_image_does_not_spoil_the_slopes_of_others(monkeypatch):
     """It moves far with any step."""
     plain, model, ground = Shifted.ground_to_image, Shifted((30.0, 30.0)), box_of(Shifted(), 20)
