@@ -20,7 +20,7 @@ from ortho_pipeline.exchange.rpc import rpc_metadata, write_rpc_txt
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
 from ortho_pipeline.host import Host
 from ortho_pipeline.host.discovery import _discovered
-from ortho_pipeline.models import RPC, SensorModel
+from ortho_pipeline.models import KINDS, RPC, SensorModel
 from ortho_pipeline.runtime.signals import Terminated
 
 gdal.UseExceptions()
@@ -306,6 +306,49 @@ def test_a_plugin_cannot_end_the_process_but_a_signal_can(tmp_path):
         Host([make_plugin(make_sensor(open_scene=leave))]).open_scene(image)
     with pytest.raises(Terminated):
         Host([make_plugin(make_sensor(open_scene=ended))]).open_scene(image)
+
+
+LATE = """
+from dataclasses import dataclass
+from typing import ClassVar
+from ortho_pipeline.plugin import RPC, Scene, Sensor, hookimpl, rpc_of_dataset
+
+@dataclass(frozen=True, eq=False)
+class Late(RPC):
+    kind: ClassVar[str] = "late"
+
+    def image_to_ground(self, image, height):
+        raise KeyError("no orbit")
+
+@hookimpl
+def ortho_models():
+    return {"late": Late}
+
+@hookimpl
+def ortho_sensors():
+    yield Sensor("late", "a test", lambda dataset: dataset.GetDescription().endswith("late.tif"), open_scene)
+
+def open_scene(dataset):
+    model = Late.from_dict(rpc_of_dataset(dataset)[0].to_dict())
+    return Scene("late", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"late": model}, "here")
+"""
+
+
+def test_a_model_that_fails_after_its_scene_is_open_names_its_plugin(install, tmp_path):
+    install("third-party", "third_party_plugin", LATE)
+    _discovered.cache_clear()
+    try:
+        done = CliRunner().invoke(cli, ["info", str(make_image(tmp_path / "late.tif", make_rpc())), "--json"])
+    finally:
+        _discovered.cache_clear()
+        KINDS.pop("late", None)
+    error = json.loads(done.stdout)["error"]
+    assert (done.exit_code, error["kind"]) == (1, "PluginError")
+    told = (
+        r"plugin third_party_plugin \(third-party 1\.2\) failed \(KeyError: 'no orbit' at third_party_plugin\.py:11\)"
+    )
+    assert re.fullmatch(told, error["message"])
+    assert "author of the plugin" in error["remedy"]
 
 
 def test_a_damaged_rpc_is_blamed_on_its_file_and_not_on_the_author_of_the_plugin(tmp_path):

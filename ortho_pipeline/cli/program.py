@@ -226,6 +226,10 @@ def _fault(error: BaseException) -> OrthoError:
         )
         closed.__cause__ = error
         return closed
+    from ortho_pipeline.host.registry import fault_of_plugin
+
+    if of_plugin := fault_of_plugin(error):
+        return of_plugin
     fault = OrthoError(
         f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
         remedy="this is a bug in ortho-pipeline; run the command again with --debug and report the traceback",

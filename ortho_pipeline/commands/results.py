@@ -23,6 +23,7 @@ from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import part_of_outputs, retire, staged, together, write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.host.registry import fault_of_plugin
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report import document as report
@@ -245,8 +246,8 @@ def attempted(make: Callable[[], _R], files: dict[str, Path], *of_report: str) -
         retire(files.pop(kind) for kind in of_report if kind in files)
         why = f"{type(error).__name__}: {error}".removesuffix(": ")
         remedy = "this is a bug in ortho-pipeline: please report it with the traceback"
-        if isinstance(error, OrthoError):
-            why, remedy = error.message, error.remedy or remedy
+        if known := error if isinstance(error, OrthoError) else fault_of_plugin(error):
+            why, remedy = known.message, known.remedy or remedy
         failure = ReportError(
             Text("the report could not be made (", why, "); the other outputs are complete"), remedy=remedy
         )

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
+from traceback import walk_tb
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -61,6 +62,23 @@ class Broken:
 
     def __str__(self) -> str:
         return f"plugin {self.plugin!r} of {self.distribution} {self.version} is skipped: {self.error}"
+
+
+def fault_of_plugin(error: BaseException) -> PluginError | None:
+    """Return an exception as the fault of the installed sensor or model whose code it passed; None without one."""
+    packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame, _ in walk_tb(error.__traceback__)}
+    for entry in metadata.entry_points(group=hookspecs.PROJECT_NAME):
+        if entry.module.partition(".")[0] not in packages or entry.dist is None:
+            continue
+        origin = Origin(entry.name, entry.value, entry.dist.name, entry.dist.version)
+        if not origin.bundled:
+            fault = PluginError(
+                f"plugin {origin.plugin} ({origin}) failed ({described(error, entry.module)})",
+                remedy="report it to the author of the plugin",
+            )
+            fault.__cause__ = error
+            return fault
+    return None
 
 
 class Registry:
