@@ -115,7 +115,9 @@ def size_of_image(path: Path | VsiPath) -> tuple[int, int] | None:
     """Return columns and rows of the image for which an RPC file was made; None if the file does not state them."""
     if path.suffix.lower() != ".geom" or not path.is_file():
         return None
-    sizes = dict(re.findall(r"^\s*number_(samples|lines):\s*(\d{1,9})\s*$", _text_of(path), re.MULTILINE | re.ASCII))
+    sizes = dict(
+        re.findall(r"^[ \t]*number_(samples|lines):[ \t]*(\d{1,9})[ \t\r]*$", _text_of(path), re.MULTILINE | re.ASCII)
+    )
     return (int(sizes["samples"]), int(sizes["lines"])) if len(sizes) == 2 else None
 
 

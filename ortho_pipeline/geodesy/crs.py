@@ -44,11 +44,9 @@ _WGS84_SEMI_MAJOR = 6378137.0
 #: Realisations differ by less (m). Other datums on an ellipsoid of the same size by 4 to 80 m (GGRS87, VN-2000).
 _REALISATIONS = 3.0
 #: How WKT, PROJJSON and PROJ strings begin. PROJ seeks anything else by its name, for a quarter of a second.
-_STATED = re.compile(
-    r"\s*(?:\{|[A-Za-z]\w{0,40}\s*[\[(]|\+?\s*(?:proj|init|title)\s*=|\+?\w+\s*=.*\bproj\s*=)", re.DOTALL
-)
+_STATED = re.compile(r"(?:\{|[A-Za-z]\w{0,40}\s*[\[(]|\+?\s*(?:proj|init|title)\s*=|\+?\w+\s*=.*\bproj\s*=)", re.DOTALL)
 #: Codes, URNs and names: the longest name in PROJ's database has 106 characters.
-_NAME = re.compile(r"\s*[\w ,.:/&@'()\[\]+–-]{1,200}( = \w+)?\s*")
+_NAME = re.compile(r"[\w ,.:/&@'()\[\]+–-]{1,200}( = \w+)?")
 
 
 def add_system_grids() -> tuple[str, ...]:
@@ -90,7 +88,8 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
         return text
     try:
         refuse_files(text if isinstance(text, str) else json.dumps(text))
-        if isinstance(text, str) and not _STATED.match(text) and not _NAME.fullmatch(text):
+        # Without the blanks around it: a pattern with them would try each of them as the beginning.
+        if isinstance(text, str) and not _STATED.match(text.strip()) and not _NAME.fullmatch(text.strip()):
             raise ValueError("not a name, a code or a definition of a CRS")
         return pyproj.CRS.from_user_input(text)
     except (CRSError, ProjError, ValueError, TypeError, RecursionError) as error:

@@ -44,7 +44,7 @@ def unread(dataset: Any) -> Unread | None:
 
 def _table_of(image: Path) -> str | None:
     """Return the name of a text file next to an image with a line of the image's name and six numbers."""
-    row = re.compile(rf"^\s*\"?{re.escape(image.stem)}(?:\.\w{{1,5}})?\"?{_NUMBERS}", re.M | re.I)
+    row = re.compile(rf"^[ \t]*\"?{re.escape(image.stem)}(?:\.\w{{1,5}})?\"?{_NUMBERS}", re.M | re.I)
     for name in sorted(os.listdir(image.parent)) if image.parent.is_dir() else ():
         file = image.parent / name
         small = file.suffix.lower() in (".txt", ".csv") and file.is_file() and file.stat().st_size <= _TABLE_BYTES

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fuzz import Attack, Tally
 from mutate import mutant
+from osgeo import gdal
 from readers import BY_NAME, READERS
 from real_seeds import FILES, real_seeds
 
@@ -17,8 +20,12 @@ from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch.records import FileState, RunRecord
 from ortho_pipeline.errors import InputError, completed, reads
 from ortho_pipeline.exchange.model_file import read_model_file
+from ortho_pipeline.exchange.rpc_files import size_of_image
 from ortho_pipeline.files import parse_json
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.host.unread import unread
 from ortho_pipeline.report.stac import acquisition_time
+from ortho_pipeline.stores.stac.item import Asset
 
 #: Mutants of each reader, those of the default run first; fewer where a file takes more than some milliseconds.
 FEW, MANY = 25, 5000
@@ -214,3 +221,43 @@ def test_a_name_longer_than_a_file_system_takes(tmp_path: Path, field: str) -> N
 def test_the_end_of_time_is_no_time_of_acquisition() -> None:
     with pytest.raises(InputError, match="not a time of acquisition"):
         acquisition_time({}, "9999-12-31T23:59:59-14:00")
+
+
+def _crs_of(text: str, folder: Path) -> None:
+    with pytest.raises(InputError, match="is not a coordinate system"):
+        parse_crs(text)
+
+
+def _geom_of(text: str, folder: Path) -> None:
+    (folder / "scene.geom").write_text(text)
+    assert size_of_image(folder / "scene.geom") is None
+
+
+def _table_beside(text: str, folder: Path) -> None:
+    (folder / "notes.txt").write_text(text)
+    dataset = gdal.GetDriverByName("GTiff").Create(str(folder / "scene.tif"), 4, 4)
+    assert unread(dataset) is None
+
+
+def _asset_name(text: str, folder: Path) -> None:
+    assert not Asset("a", text, (), "").is_rpc
+
+
+@pytest.mark.parametrize(
+    ("read", "text"),
+    [
+        (_crs_of, " " * 90_000 + "\x01"),
+        (_crs_of, "\t" * 90_000 + "\x01"),
+        (_geom_of, "\n" * 100_000 + "x"),
+        (_table_beside, "\n" * 100_000 + "x"),
+        (_asset_name, "rpc" * 30_000 + "x"),
+    ],
+    ids=["blank CRS", "CRS of tabs", "geom", "table", "asset"],
+)
+def test_a_long_text_takes_no_longer_than_its_length(
+    read: Callable[[str, Path], None], text: str, tmp_path: Path
+) -> None:
+    begin = time.process_time()
+    read(text, tmp_path)
+    # Linear: milliseconds. A pattern that tries every beginning of a run takes many seconds.
+    assert time.process_time() - begin < 1

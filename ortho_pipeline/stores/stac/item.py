@@ -26,7 +26,7 @@ _RASTER_TYPE = re.compile(r"image/(?!png|jpeg|webp|svg|gif)|application/(x-hdf5?
 _RASTER_NAME = re.compile(r"\.(tiff?|jp2|ntf|nitf|img|vrt|dt[0-2]|hgt)$", re.IGNORECASE)
 _TABLE_TYPE = re.compile(r"application/geo\+json|text/csv")
 _TABLE_NAME = re.compile(r"\.(csv|geojson|points|pts)$", re.IGNORECASE)
-_RPC_NAME = re.compile(r"rpc[^/]*\.(txt|xml)$|\.rpb$|\.rpc$", re.IGNORECASE)
+_RPC_TEXTS, _RPC_FILES = (".txt", ".xml"), (".rpb", ".rpc")
 _SHOWN = 12
 #: How the projection extension names a system, the most explicit first; `proj:epsg` is that of its first version.
 _SYSTEMS = ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg")
@@ -62,7 +62,9 @@ class Asset:
     @property
     def is_rpc(self) -> bool:
         """Whether it is a sidecar file with an RPC."""
-        return bool(_RPC_NAME.search(self.name)) or (self.key.lower() == "rpc" and not self.is_raster)
+        name = self.name.lower()
+        named = name.endswith(_RPC_FILES) or ("rpc" in name and name.endswith(_RPC_TEXTS))
+        return named or (self.key.lower() == "rpc" and not self.is_raster)
 
     @property
     def is_table(self) -> bool:
