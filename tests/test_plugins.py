@@ -100,6 +100,20 @@ def test_plugin_that_fails_to_import_is_left_out_with_a_warning(install, caplog,
     assert "rpc" in host.sensors
 
 
+def test_an_entry_point_that_names_no_module_is_left_out_with_a_warning(install, caplog):
+    install("third-party", "third-party-plugin", "")  # the name of the distribution, a likely mistake
+    host = Host(installed=True)
+    assert [broken.distribution for broken in host.broken] == ["third-party"]
+    assert "its entry point 'third-party-plugin' does not name a module" in caplog.text
+    assert "rpc" in host.sensors
+
+
+def test_a_distribution_that_has_lost_its_metadata_stops_nothing(install, tmp_path):
+    install("third-party", "third_party_plugin", PLUGIN.format(name="third"))
+    (tmp_path / "site" / "third_party-1.2.dist-info" / "METADATA").unlink()
+    assert Host(installed=True).provenance("third").distribution == "(unknown)"
+
+
 def test_what_a_plugin_prints_does_not_mix_with_the_document_of_a_command(install, tmp_path: Path):
     talks = PLUGIN.format(name="talkative").replace("lambda dataset: False", "lambda dataset: print('recognising')")
     install("talkative", "talkative_plugin", f"print('imported')\n{talks}")

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 BUNDLED = "ortho-pipeline"
 _TYPED, _TARGET = re.compile(r"[a-z][a-z0-9-]*"), re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _ENDING, _FILE = re.compile(r"[._-][A-Za-z0-9._-]*\.?[A-Za-z0-9]+"), re.compile(r"[a-z0-9-]+\.[a-z0-9]+")
+_ENTRY = re.compile(r"\w[\w.]*(\s*:\s*\w[\w.]*)?\s*(\[.*\])?")
 log = logging.getLogger(__name__)
 
 
@@ -64,16 +65,24 @@ class Broken:
         return f"plugin {self.plugin!r} of {self.distribution} {self.version} is skipped: {self.error}"
 
 
+def _installed(group: str) -> Iterator[tuple[Origin, metadata.EntryPoint]]:
+    """Yield the plugins that installed distributions declare, with their origins; some may have no metadata."""
+    known: dict[int, tuple[str, str]] = {}  # each access to a name or version parses all metadata
+    for entry in metadata.entry_points(group=group):
+        if id(entry.dist) not in known:
+            fields = entry.dist.metadata if entry.dist else {"Name": "", "Version": ""}
+            known[id(entry.dist)] = fields["Name"] or "(unknown)", fields["Version"] or ""
+        yield Origin(entry.name, entry.value, *known[id(entry.dist)]), entry
+
+
 def fault_of_plugin(error: BaseException) -> PluginError | None:
     """Return an exception as the fault of the installed sensor or model whose code it passed; None without one."""
     packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame, _ in walk_tb(error.__traceback__)}
-    for entry in metadata.entry_points(group=hookspecs.PROJECT_NAME):
-        if entry.module.partition(".")[0] not in packages or entry.dist is None:
-            continue
-        origin = Origin(entry.name, entry.value, entry.dist.name, entry.dist.version)
-        if not origin.bundled:
+    for origin, _ in _installed(hookspecs.PROJECT_NAME):
+        module = origin.module.partition(":")[0]
+        if module.partition(".")[0] in packages and not origin.bundled:
             fault = PluginError(
-                f"plugin {origin.plugin} ({origin}) failed ({described(error, entry.module)})",
+                f"plugin {origin.plugin} ({origin}) failed ({described(error, module)})",
                 remedy="report it to the author of the plugin",
             )
             fault.__cause__ = error
@@ -119,22 +128,17 @@ class Registry:
 
     def register_installed(self) -> None:
         """Register the plugins that installed distributions declare as entry points."""
-        known: dict[int, tuple[str, str]] = {}  # each access to a name or version parses all metadata
-        origins: list[tuple[Origin, metadata.EntryPoint]] = []
-        for entry in metadata.entry_points(group=self._group):
-            if id(entry.dist) not in known:
-                fields = entry.dist.metadata if entry.dist else {"Name": "(unknown)", "Version": ""}
-                known[id(entry.dist)] = fields["Name"], fields["Version"]
-            origins.append((Origin(entry.name, entry.value, *known[id(entry.dist)]), entry))
         # Bundled plugins first: their names are reserved.
-        for origin, entry in sorted(origins, key=lambda pair: (not pair[0].bundled, pair[1].name)):
+        for origin, entry in sorted(_installed(self._group), key=lambda pair: (not pair[0].bundled, pair[1].name)):
             if origin.bundled:
                 self._reserved.add(entry.name)
             try:
+                if not _ENTRY.fullmatch(entry.value):
+                    raise ImportError(f"its entry point {entry.value!r} does not name a module")
                 plugin = entry.load()
             except (Exception, SystemExit) as error:
                 # A plugin is foreign code: whatever fails in its import, continue with the others.
-                self._leave_out(Broken(entry.name, origin.distribution, origin.version, described(error, entry.module)))
+                self._leave_out(Broken(entry.name, origin.distribution, origin.version, described(error, entry.value)))
                 continue
             self.register(plugin, origin)
 
