@@ -253,3 +253,27 @@ def test_a_closed_folder_and_a_link_in_a_circle_do_not_hide_the_rest(tmp_path, m
     monkeypatch.setattr(os, "scandir", closed)
     assert [file.path for file in survey(tmp_path).found] == ["points.csv"]
     assert "lost+found: cannot read this folder (Permission denied); it is left out" in caplog.text
+
+
+def test_points_without_crs_or_datum_are_listed_and_used_in_the_next_command(folder):
+    text = (folder / "gcps.csv").read_text()
+    (folder / "gcps.csv").write_text("\n".join(line for line in text.splitlines() if not line.startswith("#")))
+    said = run("info", folder).stdout
+    assert "incomplete: the CRS of these points is unknown" in said
+    assert "No control points found" not in said
+    assert f"--gcps {folder / 'gcps.csv'}" in said
+    assert "--points-vertical egm96" in said
+
+
+def test_points_of_several_images_are_listed_and_go_to_the_adjustment(tmp_path):
+    shutil.copytree(SAMPLE / "photos", tmp_path / "photos")
+    shutil.copy(SAMPLE / "dem.tif", tmp_path)
+    lines = [f"530000 4120000 800 100 200 photo{number}.jpg g1" for number in (1, 2)]
+    gcps = tmp_path / "photos/gcp_list.txt"
+    gcps.write_text("\n".join(["EPSG:32636", *lines]))
+    said = run("info", tmp_path).stdout
+    assert "incomplete: the height datum of these points is unknown" in said
+    assert f"ortho adjust {tmp_path} --ties auto --dem {tmp_path / 'dem.tif'} --points {gcps} --orthos" in said
+    gcps.write_text("\n".join(["id,image,col,row", *(f"t1,photo{number}.jpg,100,200" for number in (1, 2))]))
+    said = run("info", tmp_path).stdout
+    assert "0 control points, 0 check points, 1 tie point in 2 images" in said

@@ -19,10 +19,8 @@ from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.options import SceneOptions
 
 if TYPE_CHECKING:
-    from ortho_pipeline.commands.survey.folder import FolderSurvey, Kind
+    from ortho_pipeline.commands.survey.folder import FolderSurvey
 
-#: Kinds of files that belong to a scene.
-_KINDS: tuple[Kind, ...] = ("dem", "points", "map image")
 #: The five most common tasks, and their commands.
 STEPS = (
     ("List your files and the next command", "ortho info FOLDER"),
@@ -122,7 +120,7 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
         return print_json({**seen.to_json(), "next": next_steps(seen)})
     wide = max([0, *(len(file.path) for file in seen.found)])
     for file in seen.found:
-        say(f"{file.kind:<10} {file.path:<{wide}}   {file.said}")
+        say(f"{file.kind:<12} {file.path:<{wide}}   {file.said}")
     say("\nNext:" if seen.found else "Next:")
     for line in next_steps(seen):
         say(f"  {line}")
@@ -151,6 +149,29 @@ def _without_images(seen: FolderSurvey) -> list[str]:
     ]
 
 
+def _control_of(seen: FolderSurvey, scene: str, block: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return what to say of the control of scenes, and the options that give it; `block` are points of several."""
+    from ortho_pipeline.commands.survey.folder import INCOMPLETE
+
+    points, maps = block or seen.beside(scene, "points"), seen.beside(scene, "map image")
+    if points:
+        incomplete = any(file.path == points[0] and file.said.startswith(INCOMPLETE) for file in seen.found)
+        note = (
+            f"{points[0]} does not state the CRS or the height datum of its points. Add what its author states: "
+            "'--points-crs EPSG:n', '--points-vertical egm96', '--points-vertical egm2008' or "
+            "'--points-vertical ellipsoid'."
+        )
+        return [note] if incomplete else [], ["--points" if block else "--gcps", os.path.join(seen.folder, points[0])]
+    if maps:
+        note = f"No control points found for {scene}. The command below matches them with {maps[0]}."
+        return [note], ["--reference", os.path.join(seen.folder, maps[0])]
+    note = (
+        f"No control points found for {scene}. The ortho will be as accurate as the delivered model. "
+        "To improve it, add measured points ('--gcps FILE') or an ortho of the same place ('--reference ORTHO')."
+    )
+    return [note], []
+
+
 def next_steps(seen: FolderSurvey) -> list[str]:
     """Return the next steps for the files of a folder: sentences, and commands to paste."""
     from ortho_pipeline.commands.survey.folder import NO_DATUM
@@ -162,7 +183,7 @@ def next_steps(seen: FolderSurvey) -> list[str]:
 
     if not scenes:
         return _without_models(seen, images) if images else _without_images(seen)
-    dems, points, maps = (seen.beside(scenes[0], kind) for kind in _KINDS)
+    dems = seen.beside(scenes[0], "dem")
     notes, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
     if not dems:
         notes.append(
@@ -174,22 +195,17 @@ def next_steps(seen: FolderSurvey) -> list[str]:
             f"{dems[0]} does not declare its height datum. Add the one that its vendor states: '--dem-vertical egm96', "
             "'--dem-vertical egm2008' or '--dem-vertical ellipsoid'."
         )
-    if points:
-        words += ["--gcps", at(points[0])]
-    elif maps:
-        words += ["--reference", at(maps[0])]
-        notes.append(f"No control points found for {scenes[0]}. The command below matches them with {maps[0]}.")
-    else:
-        notes.append(
-            f"No control points found for {scenes[0]}. The ortho will be as accurate as the delivered model. "
-            "To improve it, add measured points ('--gcps FILE') or an ortho of the same place ('--reference ORTHO')."
-        )
+    points = seen.beside(scenes[0], "points")
+    block = seen.beside(scenes[0], "block points") if len(scenes) > 1 else []
+    more, given = _control_of(seen, scenes[0], block)
+    notes, words = [*notes, *more], [*words, *given]
     if len(scenes) == 1:
         return [*notes, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
     frames = [file for file in seen.found if file.kind == "scene" and "frame" in file.models]
-    if len(frames) == len(scenes) and not points:
+    if block or (len(frames) == len(scenes) and not points):
         line = shlex.join(["ortho", "adjust", str(seen.folder), "--ties", "auto", *words, "--orthos", "-o", "out"])
-        return [*notes, f"Adjust the {len(scenes)} photos together, and make their orthos:", f"  {line}"]
+        what = counted(len(scenes), "photo" if len(frames) == len(scenes) else "scene")
+        return [*notes, f"Adjust the {what} together, and make their orthos:", f"  {line}"]
     file = at("pipeline.yaml")
     network = [] if all(seen.beside(name, "dem") for name in scenes) else ["--allow-network"]
     lines = [

@@ -13,6 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ortho_pipeline import host
+from ortho_pipeline.block.point_files import read_block_points
+from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
 from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
 from ortho_pipeline.display.notices import Notice
@@ -23,12 +25,12 @@ from ortho_pipeline.files.shell import typed
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.host.unread import unread
 from ortho_pipeline.options import SceneOptions
-from ortho_pipeline.points import read_points
+from ortho_pipeline.points import Points, read_points
 from ortho_pipeline.points.formats import SUFFIXES
 from ortho_pipeline.raster.source import open_dataset
 
 _log = logging.getLogger(__name__)
-Kind = Literal["scene", "dem", "map image", "image", "points"]
+Kind = Literal["scene", "dem", "map image", "image", "points", "block points"]
 
 #: Endings of files that are tried as images and as points.
 IMAGES = (
@@ -56,6 +58,8 @@ _PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img", ".png", ".jpg", ".j
 _RAW = (".dng", ".heic", ".heif", ".arw", ".cr2", ".cr3", ".nef", ".raf", ".orf", ".rw2")
 #: Files that are looked at, and folders below the given one.
 _MOST, _DEPTH = 2000, 3
+#: Fields that a file of points may leave to options, and what is said of a file without them.
+_TO_STATE, INCOMPLETE = ("points.crs", "points.vertical"), "incomplete: "
 #: Images that a notice names.
 _NAMED = 10
 
@@ -91,9 +95,9 @@ class FolderSurvey:
         """Return the files of a kind that belong to a scene: named after it, in its folder, or above it.
 
         What bears another scene's name is that one's; what lies in a folder above belongs to the scenes of that folder
-        if it has some. The only DEM of the delivery, in a folder without scenes, belongs to all; what there is only one
-        of belongs to the only scene. Points of which most are outside of an image were measured in another one, such as
-        the pan image of a bundle.
+        if it has some. The only DEM or block points of the delivery, in a folder without scenes, belong to all; what
+        there is only one of belongs to the only scene. Points of which most are outside of an image were measured in
+        another one, such as the pan image of a bundle.
         """
         reach = {file.path: file.reach for file in self.found}
         mine, others = Path(scene).stem, {Path(name).stem for name in self.of("scene")} - {Path(scene).stem}
@@ -106,7 +110,7 @@ class FolderSurvey:
             if free := [name for name in here if not any(Path(name).stem.startswith(other) for other in others)]:
                 return free
         only = [name for name in self.of(kind) if _fits(reach[name], reach[scene])]
-        if kind != "dem" and len(self.of("scene")) > 1:
+        if kind not in ("dem", "block points") and len(self.of("scene")) > 1:
             return []
         alone = len(only) == 1 and not any(Path(name).parent == Path(only[0]).parent for name in self.of("scene"))
         return only if alone else []
@@ -278,20 +282,34 @@ def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -
 
 
 def _points(path: Path, name: str) -> SurveyedFile | None:
+    """Describe control and check points of one image, or the points of a block; None if it is another text."""
     try:
         points = read_points(path)
     except OrthoError as error:
-        # Any text may have this suffix; a table with a valid header is listed with its missing parts.
-        return (
-            SurveyedFile(name, "points", f"incomplete: {error.message}") if error.field in ("crs", "vertical") else None
-        )
-    roles = [
-        counted(int(mask.sum()), f"{role} point")
-        for role, mask in (("control", points.control), ("check", points.check))
-    ]
+        return _incomplete(name, "points", error) or _block_points(path, name)
     pixels = points.image[np.isfinite(points.image).all(axis=1)]
     column, row = np.median(pixels, axis=0).tolist() if len(pixels) else (0.0, 0.0)
-    return SurveyedFile(name, "points", ", ".join(roles), reach=(column, row))
+    return SurveyedFile(name, "points", _roles(points), reach=(column, row))
+
+
+def _block_points(path: Path, name: str) -> SurveyedFile | None:
+    try:
+        points = read_block_points(path)
+    except OrthoError as error:
+        return _incomplete(name, "block points", error)
+    ties = counted(int(points.tie.sum()), "tie point")
+    images = counted(len(points.images), "image")
+    return SurveyedFile(name, "block points", f"{_roles(points)}, {ties} in {images}")
+
+
+def _roles(points: Points | BlockPoints) -> str:
+    roles = (("control", points.control), ("check", points.check))
+    return ", ".join(counted(int(mask.sum()), f"{role} point") for role, mask in roles)
+
+
+def _incomplete(name: str, kind: Kind, error: OrthoError) -> SurveyedFile | None:
+    """Describe a table with a valid header that lacks its CRS or datum."""
+    return SurveyedFile(name, kind, f"{INCOMPLETE}{error.message}") if error.field in _TO_STATE else None
 
 
 def _without_parts(files: list[SurveyedFile]) -> list[SurveyedFile]:
