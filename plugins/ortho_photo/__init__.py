@@ -37,6 +37,7 @@ from ortho_pipeline.plugin import (
 OPTIONS = {
     "vertical": "height datum of the camera positions: ellipsoid, egm96, egm2008, EPSG:n, a grid file, or unknown "
     "(default, where the tags do not state it)",
+    "takeoff": "height (m) of the take-off in the datum 'vertical' (default: ellipsoid): altitudes count from it",
     "sensor_width": "width of the camera's sensor in millimetres, if the tags and the table of cameras do not tell it",
     "pitch": "where the pitch of the camera is zero: horizon or nadir (default: as the maker's tags define it)",
     "sigmas": "standard deviations of position and angles: metres,degrees (default: as the tags state)",
@@ -69,6 +70,7 @@ def open_scene(
     dataset: gdal.Dataset,
     *,
     vertical: str | None = None,
+    takeoff: str | None = None,
     sensor_width: str | None = None,
     pitch: str | None = None,
     sigmas: str | None = None,
@@ -80,11 +82,11 @@ def open_scene(
     size = dataset.RasterXSize, dataset.RasterYSize
     if pitch not in (None, HORIZON, NADIR):
         raise InputError(f"{pitch!r} must be {HORIZON} or {NADIR}", field="pitch")
-    pose = pose_of(tags, pitch)
+    pose = pose_of(tags, pitch, _takeoff(takeoff))
     if calibrate not in ("yes", "no"):
         raise InputError(f"{calibrate!r} must be yes or no", field="calibrate")
     camera = camera_of(tags, *size, _width(sensor_width))
-    stated = vertical or _known(pose.datum)
+    stated = vertical or (_known(pose.datum) if takeoff is None else "ellipsoid")
     model = _model(camera.interior, pose, stated, heights, tags)
     priors = _priors(model, pose, stated, sigmas)
     if calibrate == "yes":
@@ -199,6 +201,15 @@ def _facts(tags: Tags, pose: PhotoPose, model: FrameCamera, camera: PhotoCamera,
         "focal_length_px": round(model.interior.focal_length / model.interior.pitch_x, 3),
         "interior_orientation": camera.source,
     }
+
+
+def _takeoff(text: str | None) -> float | None:
+    if text is None:
+        return None
+    height = number_of(text)
+    if not math.isfinite(height):
+        raise InputError(f"{text!r} is not a height", field="takeoff", remedy="give metres, such as 612.5")
+    return height
 
 
 def _width(text: str | None) -> float | None:

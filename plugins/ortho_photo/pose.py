@@ -60,15 +60,17 @@ class PhotoPose:
         return math.degrees(math.acos(max(-1.0, min(1.0, -float(self.rotation[2, 2])))))
 
 
-def pose_of(tags: Tags, pitch: str | None) -> PhotoPose:
+def pose_of(tags: Tags, pitch: str | None, takeoff: float | None = None) -> PhotoPose:
     """Return the pose in the tags; `pitch` says where pitch is zero, if the tags say it wrongly.
+
+    Altitudes above take-off count from the height of the `takeoff` (m).
 
     Raises
     ------
     InputError
         If position, altitude or angles are missing or impossible.
     """
-    position = position_of(tags)
+    position = position_of(tags, takeoff)
     angles, convention = _angles(tags, pitch)
     return PhotoPose(position, rotation_of(angles, convention), angles, convention, _datum(tags))
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ortho_photo.tags import Tags
-from ortho_pipeline.plugin import InputError, Notice
+from ortho_photo.tags import REMEDY, Tags
+from ortho_pipeline.plugin import InputError, Notice, Setting, Text
 
 #: Standard deviation (m) in plan and height of a position without a stated accuracy: a receiver without corrections,
 #: and a height that follows the air pressure from take-off.
@@ -57,8 +57,10 @@ class _Source:
     rounded: float = 0.0
 
 
-def position_of(tags: Tags) -> Position:
+def position_of(tags: Tags, takeoff: float | None = None) -> Position:
     """Return the position: that of XMP, unless EXIF alone states an accuracy.
+
+    With the height of the `takeoff` (m), the altitude is that above it: DJI's relative altitude, else the altitude.
 
     Raises
     ------
@@ -79,25 +81,41 @@ def position_of(tags: Tags) -> Position:
     lon, lat = placed.place
     if not (abs(lat) <= 90 and abs(lon) <= 360):
         raise tags.error(f"latitude {lat}, longitude {lon} is not on Earth", "GPSLatitude")
-    levelled = next((source for source in sources if source.altitude is not None), None)
-    if levelled is None or levelled.altitude is None:
-        raise tags.error("this photo has a position, but no altitude", "GPSAltitude")
-    if not -1000 < levelled.altitude < 100_000:
-        raise tags.error(f"an altitude of {levelled.altitude} m is impossible", "GPSAltitude")
     # An accuracy in a source without a position is that of the only position.
     other = exif if placed is xmp else xmp
     plan_by = placed if placed.plan or other.place else other
-    other = exif if levelled is xmp else xmp
-    height_by = levelled if levelled.height or other.altitude is not None else other
-    height = height_by.height or max(HEIGHT, plan_by.plan or 0.0)
+    altitude, height = _altitude(tags, sources, plan_by.plan or 0.0, takeoff)
+    if not -1000 < altitude < 100_000:
+        raise tags.error(f"an altitude of {altitude} m is impossible", "GPSAltitude")
     return Position(
         lon,
         lat,
-        levelled.altitude,
+        altitude,
         (math.hypot(max(plan_by.plan or PLAN, LEAST), placed.rounded), max(height, LEAST)),
         plan_by.positioning if plan_by.plan else "no accuracy in the tags; assumed",
         _differing(tags, placed, xmp, exif),
     )
+
+
+def _altitude(tags: Tags, sources: tuple[_Source, _Source], plan: float, takeoff: float | None) -> tuple[float, float]:
+    """Return the altitude and its standard deviation; `plan` is the stated one in plan, or 0."""
+    above = tags.optional("drone-dji:RelativeAltitude")
+    levelled = next((source for source in sources if source.altitude is not None), None)
+    stated = None if levelled is None else levelled.altitude
+    if takeoff is not None and (relative := stated if above is None else above) is not None:
+        return takeoff + relative, max(HEIGHT, plan)
+    if levelled is None or stated is None:
+        known = "" if above is None else f" but that above take-off ({above:g} m)"
+        remedy = Text(
+            "give the height of the take-off with ",
+            Setting("scene.sensor_options", "METRES", key="takeoff"),
+        )
+        raise tags.error(
+            f"this photo has a position, but no altitude{known}", "GPSAltitude", REMEDY if above is None else remedy
+        )
+    other = next(source for source in sources if source is not levelled)
+    height_by = levelled if levelled.height or other.altitude is not None else other
+    return stated, height_by.height or max(HEIGHT, plan)
 
 
 def _of_xmp(tags: Tags) -> _Source:

@@ -175,6 +175,26 @@ def test_the_height_datum_is_stated_or_unknown_and_never_guessed(tmp_path):
     assert stated.notices == ()
 
 
+def test_an_altitude_above_takeoff_counts_from_the_height_of_the_takeoff(tmp_path):
+    lacking = photo(tmp_path / "a.tif", without(EXIF, "Altitude"), without(DJI, "Absolute"))
+    with pytest.raises(InputError, match=r"no altitude but that above take-off \(100 m\)") as error:
+        opened(lacking)
+    assert "takeoff=METRES" in error.value.remedy
+    rtk = {f"drone-dji:RtkStd{axis}": "0.02" for axis in ("Lon", "Lat", "Hgt")}
+    # A position of RTK does not make a height by air pressure better.
+    for path in (lacking, photo(tmp_path / "b.tif", xmp={**DJI, **rtk})):
+        scene = open_scene(path, SceneOptions(sensor_options={"takeoff": "612.5", "calibrate": "no"}))
+        assert scene.model.perspective_centre[2] == pytest.approx(712.5)
+        assert scene.facts["altitude_datum"] == "ellipsoid"
+        assert scene.priors["Z_L"].sigma == pytest.approx(10.0)
+        assert scene.notices == ()
+    # Without a tag of its own, the height above take-off is the altitude; the take-off has the datum of the option.
+    path = photo(tmp_path / "c.tif", {**EXIF, "GPSAltitude": "(100)"}, without(DJI, "Altitude"))
+    undulation = float(Vertical.parse("egm96").undulation(np.array([33.26]), np.array([39.5]))[0])
+    scene = opened(path, takeoff="612.5", vertical="egm96")
+    assert scene.model.perspective_centre[2] == pytest.approx(712.5 + undulation, abs=1e-6)
+
+
 @pytest.mark.parametrize("text", ["orthometric", "EGM 96 Geoid", "EPSG:4326", "../a.gtx"])
 def test_a_height_datum_in_other_words_is_unknown(tmp_path, text):
     path = photo(tmp_path / "a.tif", xmp={**CAMERA, "Camera:VertCS": text})
@@ -519,7 +539,8 @@ def test_damaged_or_missing_tags_are_one_error_each(tmp_path, exif, xmp, message
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("sensor_width", "x"), ("sigmas", "1"), ("heights", "9,1"), ("calibrate", "x")]
+    ("option", "value"),
+    [("sensor_width", "x"), ("sigmas", "1"), ("heights", "9,1"), ("calibrate", "x"), ("takeoff", "x")],
 )
 def test_wrong_options_are_errors(tmp_path, option, value):
     with pytest.raises(InputError) as error:
