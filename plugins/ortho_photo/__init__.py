@@ -103,7 +103,10 @@ def open_scene(
             "Pitch",
             Text(f"if its pitch is zero at the {other}, add ", again, "; else leave this photo out"),
         )
-    warnings = [*pose.position.notices, *([_unknown_datum(pose)] if stated == UNKNOWN else [])]
+    warnings = [
+        *pose.position.notices,
+        *([_unknown_datum(pose, tags.optional("drone-dji:RelativeAltitude"))] if stated == UNKNOWN else []),
+    ]
     return Scene(
         sensor="photo",
         path=tags.path,
@@ -169,7 +172,7 @@ def _known(datum: str) -> str:
     return datum
 
 
-def _unknown_datum(pose: PhotoPose) -> Notice:
+def _unknown_datum(pose: PhotoPose, above_takeoff: float | None) -> Notice:
     stated = f"state an unknown height datum of the camera, {pose.datum[:60]!r}"
     text = Text(
         f"the tags {stated if pose.datum else 'do not state the height datum of the camera'}. ",
@@ -177,6 +180,9 @@ def _unknown_datum(pose: PhotoPose) -> Notice:
         f"{DATUM_SIGMA:.0f} m. An adjustment with a DEM or control points estimates it. If you know the datum, add ",
         Setting("scene.sensor_options", "DATUM", key="vertical"),
     )
+    if above_takeoff is not None and abs(pose.position.altitude - above_takeoff) < DATUM_SIGMA:
+        again = Setting("scene.sensor_options", "METRES", key="takeoff")
+        text = Text(text, ". It may be the altitude above take-off. Then add the height of the take-off with ", again)
     return Notice("datum-unknown", text, altitude_m=pose.position.altitude, sigma_m=DATUM_SIGMA)
 
 

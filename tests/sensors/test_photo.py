@@ -195,6 +195,12 @@ def test_an_altitude_above_takeoff_counts_from_the_height_of_the_takeoff(tmp_pat
     assert scene.model.perspective_centre[2] == pytest.approx(712.5 + undulation, abs=1e-6)
 
 
+def test_an_unknown_altitude_that_may_be_above_takeoff_names_the_option(tmp_path):
+    for altitude, named in (("1000.5", False), ("100.5", True)):
+        [notice] = open_scene(photo(tmp_path / "a.tif", xmp={**DJI, "drone-dji:AbsoluteAltitude": altitude})).notices
+        assert ("takeoff=METRES" in notice) is named
+
+
 @pytest.mark.parametrize("text", ["orthometric", "EGM 96 Geoid", "EPSG:4326", "../a.gtx"])
 def test_a_height_datum_in_other_words_is_unknown(tmp_path, text):
     path = photo(tmp_path / "a.tif", xmp={**CAMERA, "Camera:VertCS": text})
