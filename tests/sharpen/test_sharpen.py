@@ -348,6 +348,28 @@ def test_a_large_ratio_has_a_quality_and_one_too_large_is_named() -> None:
     assert "ratio" in str(caught.value.remedy)
 
 
+@pytest.mark.parametrize("multiple", [2, 3, 4, 20])
+def test_windows_of_samples_cross_no_block_of_the_warper(multiple: int) -> None:
+    """GDAL resamples whole blocks of 512 x 128 pixels, so a window across the sides of four costs four of them."""
+    places: set[tuple[int, int, int, int]] = set()
+
+    def read(*window: int) -> tuple[np.ndarray, np.ndarray]:
+        places.add(window)
+        return np.zeros((4, *window[:1:-1])), np.ones((4, *window[:1:-1]), dtype=bool)
+
+    image: Any = SimpleNamespace(read=read)
+    grid = Grid(pyproj.CRS("EPSG:32636"), 0.0, 0.0, 2.0, 2.0, 1500, 1100)
+    read_samples(image, image, (1, 2, 3, 4), grid, multiple)
+    used = np.zeros((grid.height, grid.width), dtype=int)
+    for left, top, width, height in places:
+        used[top : top + height, left : left + width] += 1
+        if multiple < 20:  # its windows are larger than blocks
+            assert (left // 512, top // 128) == ((left + width - 1) // 512, (top + height - 1) // 128)
+    assert used.max() == 1
+    parts = [half for rows in np.array_split(used, 2) for half in np.array_split(rows, 2, axis=1)]
+    assert min(part.mean() for part in parts) > 0.2
+
+
 def test_registration_needs_a_match(tmp_path: Path) -> None:
     pan, _ = Bundle(side=256, seed=1).write(tmp_path)
     _, colours = Bundle(side=256, seed=2).write(tmp_path / "other")

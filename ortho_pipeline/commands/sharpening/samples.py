@@ -24,7 +24,8 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import Grid
 
-#: Side (coarse px) of a window, and the most values of all windows together (float32: 12 MB).
+#: Side (coarse px) of a window, and the most values of all windows together (float32: 12 MB). GDAL warps blocks of
+#: 512 x 128 pixels: a window across a side of one would cost another one.
 _SIDE, _VALUES = 128, 3_000_000
 #: Fewest pixels of the reduced images along a window, for the quality; three at each rim are not compared.
 _REDUCED = 8
@@ -76,7 +77,8 @@ def read_samples(pan: Regridded, colours: Regridded, bands: Sequence[int], grid:
     for length in (grid.width, grid.height):
         side = min(max(_SIDE, _REDUCED * multiple), length)
         side = max(side // multiple * multiple, min(multiple, length))
-        starts.append(np.linspace(0, length - side, max(1, length // side)).astype(int))
+        step = max(side, _SIDE)
+        starts.append(np.arange(max(1, length // step)) * step)
         sides.append(side)
     places = [(int(left), int(top)) for top in starts[1] for left in starts[0]]
     most = max(1, _VALUES // (sides[0] * sides[1] * (len(bands) + 1)))
