@@ -17,7 +17,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 #: Displacement (panchromatic px, RMS) beyond which colours are visibly beside their objects.
 LIMIT = 0.5
 #: Matches to try. An error that all of them share limits the mean, so more of them do not improve it.
-_MATCHES = 200
+_MATCHES = 100
 
 
 @dataclass(frozen=True)
