@@ -158,6 +158,20 @@ def test_a_wrong_edge_leaves_and_what_loops_show_is_added():
     np.testing.assert_array_equal(found.shared, errors.shared)
 
 
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("left_out", "wrong", "known"), [((), (7,), True), ((), (7, 9), False), ((8,), (7,), False)])
+def test_edges_of_a_date_that_contradict_each_other_are_not_accepted(seed, left_out, wrong, known):
+    """The last date has edges 7, 8 and 9. Two that agree are right; if none agree, nothing tells which is right."""
+    edges, trends, errors, place = loops()
+    value, random = trends.value.copy(), np.random.default_rng(seed)
+    value[list(wrong), 0] += random.choice([-1, 1], (len(wrong), 2)) * random.uniform(4, 15, (len(wrong), 2))
+    used = trends.used & ~np.isin(np.arange(11), left_out)[:, None]
+    closures, _ = network.accepted_edges(edges, dataclasses.replace(trends, value=value, used=used), errors, place, 6)
+    accepted = np.ones(11, dtype=bool)
+    accepted[[*left_out, *wrong] if known else [7, 8, 9]] = False
+    np.testing.assert_array_equal(closures.accepted, accepted)
+
+
 @pytest.mark.parametrize("size", [0.5, 1.0])
 def test_an_error_of_edges_that_their_places_do_not_show_is_found_from_loops(size):
     """Each of 400 edges errs by a shift of its own: the constant variance is its square."""

@@ -159,12 +159,14 @@ def _pairs(dates: Sequence[Dated], pairs: Sequence[DatePair], stack: AdjustedSta
                 )
             )  # fmt: skip
             continue
-        tested = bool(np.isfinite(stack.closures.ratio[edge])) and bool(stack.trends.good[edge])
+        usable = bool(stack.trends.good[edge])
+        tested = bool(np.isfinite(stack.closures.ratio[edge])) and usable
         accepted = bool(stack.closures.accepted[edge])
         status = ("accepted" if tested else "untested") if accepted else "rejected"
         reason = ""
         if not accepted:
-            reason = "does not close with the other pairs" if tested else "too few places, or no connection"
+            reason = "contradicts another pair, and no loop tells which is right" if usable else "too few places"
+            reason = "does not close with the other pairs" if tested else reason
         found.append(
             PairRecord(
                 first=first, second=second, status=status, reason=reason, matches=pair.matches.kept,

@@ -7,7 +7,8 @@ share.
 
 An edge is accepted if it closes the loop: if it differs from what all other edges say of its two dates by no more than
 their common error explains. The first solution minimises the sum of lengths, so that wrong edges hardly move it. Then
-edges leave and come back until none changes.
+edges leave and come back until none changes; only a loop brings one back. If an edge has loops with rejected edges
+alone, nothing tells which of them is right: it is not accepted either.
 
 Loops do not show errors that close them. If they show less than the stated error of edges, the rest belongs to dates:
 the ground looks different through the year, and shadows and plants displace all matches alike. Dates of one season
@@ -140,14 +141,28 @@ def accepted_edges(
     accepted = usable & ((left**2 / np.maximum(total + constant, 1e-12)).sum(axis=1) < _LIMIT)
     for _ in range(_ROUNDS):
         closures, more = _closed(edges, incidence, value, both, constant, accepted)
-        again = usable & ~(closures.ratio > _LIMIT)
+        again = usable & np.where(np.isfinite(closures.ratio), closures.ratio <= _LIMIT, accepted)
         better = np.maximum(constant + more, least)
         settled = (again == accepted).all() and (np.abs(better - constant) < _SMALL * total.mean(axis=0)).all()
         constant = better
         if settled:
             break
         accepted = again
+    accepted = accepted & ~_contradicted(edges, incidence, closures, accepted, usable & ~accepted)
     return replace(closures, accepted=accepted), replace(components, constant=constant)
+
+
+def _contradicted(
+    edges: Edges, incidence: sparse.csr_matrix, closures: Closures, accepted: NDArray[np.bool_],
+    rejected: NDArray[np.bool_],
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Return which accepted edges are in no loop, and connect the same parts as a rejected one."""
+    found = np.zeros(len(edges), dtype=bool)
+    for edge in np.flatnonzero(accepted & np.isnan(closures.ratio)):
+        part = _parts(incidence, accepted & (np.arange(len(edges)) != edge))
+        sides = np.sort([part[edges.first], part[edges.second]], axis=0)
+        found[edge] = (rejected & (sides == sides[:, [edge]]).all(axis=0)).any()
+    return found
 
 
 def _least(edges: Edges, incidence: sparse.csr_matrix, usable: NDArray[np.bool_]) -> float:
