@@ -68,3 +68,19 @@ def test_the_grid_has_the_corrected_area_of_all_dates_and_all_of_the_first() -> 
     # The second date reaches 30.2 px farther east, the third one 4 px farther west and 7.6 px farther north.
     assert (grid.left, grid.top, grid.width, grid.height) == (old.left - 4.0, old.top + 8.0, 274, 248)
     np.testing.assert_allclose(same.cells.low, np.array([4.0, 8.0]))
+
+
+def test_longitudes_on_both_sides_of_the_antimeridian_are_one_area() -> None:
+    """The second date has longitudes from -180.0005, which is 179.9995."""
+
+    def of_west(west: float) -> Dated:
+        grid = MapGrid("EPSG:4326", (west, 1e-5, 0.0, 10.0, 0.0, -1e-5), (240, 240))
+        scene = Scene(ORTHO, Path("a.tif"), 240, 240, {MapGrid.kind: grid}, "a.tif")
+        return Dated("a", Path("a.tif"), datetime(2020, 1, 1, tzinfo=UTC), "list", scene)
+
+    dates = [of_west(179.999), of_west(-180.0005), of_west(179.9992)]
+    _, _, found, _ = of_corrections(dates, np.zeros((3, 2)), [True] * 3)
+    for grid in (Placed.of(dates).grid, found.grid):
+        assert (grid.width, grid.height) == (290, 240)
+        np.testing.assert_allclose(grid.left, 179.999, atol=1e-9)
+    np.testing.assert_allclose(found.shared(dates, [(1, 0)]), [[50, 0], [240, 240]], atol=1e-4)

@@ -43,15 +43,20 @@ class Placed:
                     field="orthos",
                     remedy="reproject it to the same CRS, or leave it out",
                 )
-        return cls._over(models[0], np.concatenate([model.corners for model in models]), 1e-6)
+        return cls._over(models[0], [model.corners for model in models], 1e-6)
 
     @classmethod
-    def _over(cls, first: MapGrid, corners: Array, least: float) -> Placed:
-        """Return a grid with the pixels of the first date over corners of orthos ``(n, 3)``.
+    def _over(cls, first: MapGrid, areas: Sequence[Array], least: float) -> Placed:
+        """Return a grid with the pixels of the first date over areas, each of corners of an ortho ``(n, 3)``.
 
         Less than a part of a pixel (`least`) adds none.
         """
-        step = np.array(first.pixel)
+        if parse_crs(first.map_crs).is_geographic:
+            # Across the antimeridian some orthos have longitudes near -180, and others near 180.
+            middle = first.corners.mean(axis=0)
+            turns = [np.round((middle - area.mean(axis=0)) / 360.0) * (1, 0, 0) for area in areas]
+            areas = [area + 360.0 * turn for area, turn in zip(areas, turns, strict=True)]
+        corners, step = np.concatenate(areas), np.array(first.pixel)
         origin = np.array([first.corners[:, 0].min(), first.corners[:, 1].max()])
         places = (corners[:, :2] - origin) / step * (1, -1)
         begin, end = np.floor(places.min(axis=0) + least), np.ceil(places.max(axis=0) - least)
@@ -71,7 +76,7 @@ class Placed:
                 corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (one.scene.width, one.scene.height)
                 areas.append(self.corrected(one, stack, number).image_to_ground(corners, 0.0))
         # Pixels whose middle is outside have no value.
-        found = Placed._over(first, np.concatenate(areas), 0.5)
+        found = Placed._over(first, areas, 0.5)
         old, new = self.grid, found.grid
         moved = np.rint([(new.left - old.left) / old.dx, (old.top - new.top) / old.dy])
         return found, replace(stack, cells=stack.cells._replace(low=stack.cells.low - moved))
