@@ -367,7 +367,7 @@ def test_a_stack_in_which_no_date_can_be_corrected_is_refused(made, tmp_path):
     # The reference shows another place.
     gdal.Translate(str(tmp_path / "far.tif"), str(made[0][0]), outputBounds=[612_000, 7_123_000, 612_240, 7_122_760])
     match = MatchOptions(points=120, reference=[str(tmp_path / "far.tif")])
-    with pytest.raises(InputError, match="no accepted pair connects a date with the datum"):
+    with pytest.raises(InputError, match="no accepted pair connects a date with the datum: the reference"):
         run(made[0][:2], tmp_path / "out", StackOptions(datum="reference"), match=match)
     assert not (tmp_path / "out" / "aligned").exists()
 
@@ -397,4 +397,10 @@ def test_a_datum_that_is_no_date_and_another_crs_are_refused(made, tmp_path):
     gdal.Warp(str(other), str(made[0][0]), dstSRS="EPSG:32734")
     with pytest.raises(CrsError, match="another CRS"):
         run([made[0][0], other], tmp_path / "out")
-    assert not (tmp_path / "out" / "stack.json").exists()
+    gdal.Warp(str(tmp_path / "other.tif"), str(made[0][0]), dstSRS="EPSG:4269")
+    match = MatchOptions(points=120, reference=[str(tmp_path / "other.tif")])
+    with pytest.raises(CrsError, match="no transformation from 'WGS 84 / UTM zone 35S' to 'NAD83'") as caught:
+        run(made[0], tmp_path / "out", reference, match=match)
+    assert caught.value.file == str(tmp_path / "other.tif")
+    # This is known before anything is matched.
+    assert not (tmp_path / "out").exists()

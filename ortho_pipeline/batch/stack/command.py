@@ -19,7 +19,7 @@ from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, placed_at, tim
 from ortho_pipeline.batch.stack.document import chips_of, record_of
 from ortho_pipeline.batch.stack.items import items_of, write_items
 from ortho_pipeline.batch.stack.matching import DatePair, Matcher
-from ortho_pipeline.batch.stack.placing import Placed, pixel_of
+from ortho_pipeline.batch.stack.placing import Placed, map_grid_of, pixel_of, require_one_crs
 from ortho_pipeline.batch.stack.raw import Levelled, Rectifier
 from ortho_pipeline.batch.stack.recorded import RecordedFolder, recorded_in
 from ortho_pipeline.batch.stack.result import StackResult, part_summary, summary
@@ -27,12 +27,13 @@ from ortho_pipeline.batch.stack.writing import Writer
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.graph import pairs_of
-from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
 from ortho_pipeline.commands.results import SCHEMA_VERSION, Result
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import retire, together, write_json
 from ortho_pipeline.files.locations import Location
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.report.stack.chips import ChipSheet
@@ -198,6 +199,7 @@ class _Planned:
         output = OutputOptions(resampling="cubic") if output is None else output
         dates = dated_orthos(orthos, options.date_pattern, scene, surface)
         nodes, fixed = _with_datum(dates, options.datum, match, scene)
+        _refuse_crs(dates, nodes[len(dates) :])
         seen = [one.conditions for one in dates]
         wanted = pairs_of(
             [one.days for one in dates], options.neighbours, [one.cloud_percent for one in seen],
@@ -415,6 +417,15 @@ def _refuse_reference(dates: Sequence[Dated], match: MatchOptions) -> None:
         )
 
 
+def _refuse_crs(dates: Sequence[Dated], references: Sequence[Dated]) -> None:
+    """Refuse finished orthos whose CRS differ, and a reference in a CRS without a transformation."""
+    finished = [one for one in dates if one.scene.sensor == ORTHO]
+    require_one_crs(finished)
+    for one in references if finished else ():
+        with completed(one.path):
+            ground_transform(map_grid_of(finished[0]).crs, map_grid_of(one).crs)
+
+
 def _adjusted(
     nodes: Sequence[Dated], dates: Sequence[Dated], placed: Placed, pairs: Sequence[DatePair], datum: int | None,
     affine: bool,
@@ -439,7 +450,9 @@ def _adjusted(
     # The datum itself needs no correction.
     if solved.determined.sum() < 2:
         other = "others" if datum is None else "datum"
-        raise InputError(f"no accepted pair connects a date with the {other}", field="orthos", remedy=remedy)
+        reasons = [pair.reason for pair in pairs if pair.matches is None and datum in (None, pair.first, pair.second)]
+        why = f": {reasons[0]}" if reasons else ""
+        raise InputError(f"no accepted pair connects a date with the {other}{why}", field="orthos", remedy=remedy)
     return solved
 
 

@@ -26,23 +26,8 @@ class Placed:
 
     @classmethod
     def of(cls, dates: Sequence[Dated]) -> Placed:
-        """Return the grid of orthos as they were delivered.
-
-        Raises
-        ------
-        CrsError
-            If their CRS differ.
-        """
+        """Return the grid of orthos of one CRS as they were delivered."""
         models = [map_grid_of(one) for one in dates]
-        crs = parse_crs(models[0].map_crs)
-        for one, model in zip(dates, models, strict=True):
-            if parse_crs(model.map_crs) != crs:
-                raise CrsError(
-                    f"this ortho has another CRS than {dates[0].path.name}",
-                    file=one.path,
-                    field="orthos",
-                    remedy="reproject it to the same CRS, or leave it out",
-                )
         return cls._over(models[0], [model.corners for model in models], 1e-6)
 
     @classmethod
@@ -121,6 +106,24 @@ class Placed:
             across, down = np.zeros(2), np.zeros(2)
         coefficients = np.array([middle[0], across[0], down[0], middle[1], across[1], down[1]])
         return ImageCorrection(own, kind, (float(origin[0]), float(origin[1])), coefficients)
+
+
+def require_one_crs(orthos: Sequence[Dated]) -> None:
+    """Refuse orthos whose CRS differ.
+
+    Raises
+    ------
+    CrsError
+        It names the first that has another one.
+    """
+    for one in orthos:
+        if parse_crs(map_grid_of(one).map_crs) != parse_crs(map_grid_of(orthos[0]).map_crs):
+            raise CrsError(
+                f"this ortho has another CRS than {orthos[0].path.name}",
+                file=one.path,
+                field="orthos",
+                remedy="reproject it to the same CRS, or leave it out",
+            )
 
 
 def map_grid_of(one: Dated) -> MapGrid:
