@@ -49,6 +49,7 @@ WITHOUT = {
     ("errors", "pip install"): "needs the network",
     ("ortho_measure", "pip install"): "needs the network",
     ("points", "pip install"): "needs the network",
+    ("commands", "ortho measure"): "serves a page until somebody stops it",
     ("report", "ortho measure"): "serves a page until somebody stops it",
     ("points", "ortho measure"): "serves a page until somebody stops it",
     ("commands", "ortho doctor --fetch-grids"): "needs the network",

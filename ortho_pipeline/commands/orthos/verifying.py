@@ -204,7 +204,7 @@ def _refuse_points_of_scene(points: Points, ortho: Scene) -> None:
             f"these points were measured in the raw scene, not in the ortho: {file.name} has the same columns and rows",
             file=points.source or None,
             field="points.gcps",
-            remedy="measure the points in the ortho (ortho measure --ortho) and give that file",
+            remedy="measure the points in the ortho ('ortho measure ORTHO') and give that file",
         )
 
 
