@@ -70,8 +70,11 @@ def _installed(group: str) -> Iterator[tuple[Origin, metadata.EntryPoint]]:
     known: dict[int, tuple[str, str]] = {}  # each access to a name or version parses all metadata
     for entry in metadata.entry_points(group=group):
         if id(entry.dist) not in known:
-            fields = entry.dist.metadata if entry.dist else {"Name": "", "Version": ""}
-            known[id(entry.dist)] = fields["Name"] or "(unknown)", fields["Version"] or ""
+            known[id(entry.dist)] = "(unknown)", ""
+            # Some versions of importlib raise where the metadata are missing, others return none.
+            with contextlib.suppress(FileNotFoundError):
+                fields = entry.dist.metadata if entry.dist else {"Name": "", "Version": ""}
+                known[id(entry.dist)] = fields["Name"] or "(unknown)", fields["Version"] or ""
         yield Origin(entry.name, entry.value, *known[id(entry.dist)]), entry
 
 
