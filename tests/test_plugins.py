@@ -353,16 +353,21 @@ def test_a_model_that_fails_after_its_scene_is_open_names_its_plugin(install, tm
     _discovered.cache_clear()
     try:
         done = CliRunner().invoke(cli, ["info", str(make_image(tmp_path / "late.tif", make_rpc())), "--json"])
+        (tmp_path / "run.yaml").write_text("scenes:\n- image: late.tif\n  surface: {height: 700}\n")
+        CliRunner().invoke(cli, ["run", str(tmp_path / "run.yaml"), "--executor", "sequential"])
     finally:
         _discovered.cache_clear()
         KINDS.pop("late", None)
     error = json.loads(done.stdout)["error"]
+    scene = json.loads((tmp_path / "out" / "run.json").read_text())["scenes"][0]["error"]
     assert (done.exit_code, error["kind"]) == (1, "PluginError")
     told = (
         r"plugin third_party_plugin \(third-party 1\.2\) failed \(KeyError: 'no orbit' at third_party_plugin\.py:11\)"
     )
     assert re.fullmatch(told, error["message"])
     assert "author of the plugin" in error["remedy"]
+    assert (scene["kind"], scene["remedy"]) == ("PluginError", error["remedy"])
+    assert re.fullmatch(told, scene["message"])
 
 
 def test_a_damaged_rpc_is_blamed_on_its_file_and_not_on_the_author_of_the_plugin(tmp_path):

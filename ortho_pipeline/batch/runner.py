@@ -43,6 +43,7 @@ from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_doc
 from ortho_pipeline.files import allowed, append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.files.folders import is_removable
 from ortho_pipeline.files.locations import Location
+from ortho_pipeline.host.registry import fault_of_plugin
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.runtime.process_limits import Progress
@@ -120,7 +121,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         done.write(job.record)
         return Outcome(job.name, "done", done.seconds, paths_of(done, job), done.facts)
     except Exception as error:
-        document = error_document(error)
+        document = error_document(fault_of_plugin(error) or error)
         failed = RunRecord(
             name=job.name, key="", status="failed", outputs=before, seconds=time.monotonic() - begin, error=document
         )

@@ -80,6 +80,8 @@ def _installed(group: str) -> Iterator[tuple[Origin, metadata.EntryPoint]]:
 
 def fault_of_plugin(error: BaseException) -> PluginError | None:
     """Return an exception as the fault of the installed sensor or model whose code it passed; None without one."""
+    if isinstance(error, OrthoError | MemoryError):
+        return None
     packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame, _ in walk_tb(error.__traceback__)}
     for origin, _ in _installed(hookspecs.PROJECT_NAME):
         module = origin.module.partition(":")[0]
