@@ -100,6 +100,13 @@ def test_plugin_that_fails_to_import_is_left_out_with_a_warning(install, caplog,
     assert "rpc" in host.sensors
 
 
+def test_the_line_of_a_failing_import_is_told_for_an_entry_point_with_an_object(install, tmp_path):
+    install("third-party", "third_party_plugin", "\nraise OSError('broken')\n")
+    info = tmp_path / "site" / "third_party-1.2.dist-info"
+    (info / "entry_points.txt").write_text("[ortho_pipeline]\nthird = third_party_plugin : plugin [more]\n")
+    assert [broken.error for broken in Host(installed=True).broken] == ["OSError: broken at third_party_plugin.py:2"]
+
+
 def test_an_entry_point_that_names_no_module_is_left_out_with_a_warning(install, caplog):
     install("third-party", "third-party-plugin", "")  # the name of the distribution, a likely mistake
     host = Host(installed=True)

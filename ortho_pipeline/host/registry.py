@@ -47,6 +47,11 @@ class Origin:
         return f"{self.distribution} {self.version}".strip()
 
     @property
+    def code(self) -> str:
+        """The name of the module without that of an object in it."""
+        return self.module.partition(":")[0].partition("[")[0].strip()
+
+    @property
     def bundled(self) -> bool:
         """Whether the plugin belongs to ortho-pipeline."""
         return self.distribution.lower().replace("_", "-").replace(".", "-") == BUNDLED
@@ -84,10 +89,9 @@ def fault_of_plugin(error: BaseException) -> PluginError | None:
         return None
     packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame, _ in walk_tb(error.__traceback__)}
     for origin, _ in _installed(hookspecs.PROJECT_NAME):
-        module = origin.module.partition(":")[0]
-        if module.partition(".")[0] in packages and not origin.bundled:
+        if origin.code.partition(".")[0] in packages and not origin.bundled:
             fault = PluginError(
-                f"plugin {origin.plugin} ({origin}) failed ({described(error, module)})",
+                f"plugin {origin.plugin} ({origin}) failed ({described(error, origin.code)})",
                 remedy="report it to the author of the plugin",
             )
             fault.__cause__ = error
@@ -143,7 +147,7 @@ class Registry:
                 plugin = entry.load()
             except (Exception, SystemExit) as error:
                 # A plugin is foreign code: whatever fails in its import, continue with the others.
-                self._leave_out(Broken(entry.name, origin.distribution, origin.version, described(error, entry.value)))
+                self._leave_out(Broken(entry.name, origin.distribution, origin.version, described(error, origin.code)))
                 continue
             self.register(plugin, origin)
 
