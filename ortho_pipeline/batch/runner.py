@@ -473,7 +473,7 @@ class _Mosaic:
 
 def _make_in_run(job: Job, checksums: bool) -> Outcome:
     # A worker on another machine may have a folder of its own at this path.
-    if not (job.output / _RUN_LOCK).is_file():
+    if not os.path.isfile(job.output / _RUN_LOCK):
         raise InputError(
             "this worker does not have the output folder of the run",
             file=job.output,
