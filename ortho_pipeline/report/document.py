@@ -87,6 +87,7 @@ __all__ = [
     "preview_png",
     "read_report",
     "read_report_json",
+    "report_of_ortho",
     "residuals_geojson",
     "residuals_style",
     "summary_text",
@@ -441,6 +442,17 @@ def read_report(path: str | PathLike[str]) -> SceneReport:
         raise InputError(
             f"the report is damaged: {error.fault}", file=path, field=error.place, remedy="make the report again"
         ) from error
+
+
+def report_of_ortho(ortho: str | PathLike[str]) -> SceneReport | None:
+    """Return the report next to an ortho `<stem>_ortho.tif`; None without one that can be read."""
+    path = Path(str(ortho).replace("_ortho.tif", "_report.json"))
+    if path.suffix != ".json" or not path.is_file():
+        return None
+    try:
+        return read_report(path)
+    except InputError:
+        return None
 
 
 def write_plots(report: SceneReport, folder: Path, stem: str, kind: str = "svg") -> dict[str, Path]:

@@ -164,9 +164,10 @@ def _pairs(dates: Sequence[Dated], pairs: Sequence[DatePair], stack: AdjustedSta
         accepted = bool(stack.closures.accepted[edge])
         status = ("accepted" if tested else "untested") if accepted else "rejected"
         reason = ""
-        if not accepted:
+        if not accepted and tested:
+            reason = "does not close with the other pairs"
+        elif not accepted:
             reason = "contradicts another pair, and no loop tells which is right" if usable else "too few places"
-            reason = "does not close with the other pairs" if tested else reason
         found.append(
             PairRecord(
                 first=first, second=second, status=status, reason=reason, matches=pair.matches.kept,

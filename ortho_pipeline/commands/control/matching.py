@@ -27,7 +27,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
-from ortho_pipeline.report.document import read_report
+from ortho_pipeline.report.document import report_of_ortho
 from ortho_pipeline.report.matching import (
     Candidate,
     MatchComponents,
@@ -387,13 +387,8 @@ def _names(reference: Reference, image: str) -> bool:
     described = reference.intensity.source.dataset.GetMetadata() or {}
     if any(image in str(text) for text in described.values()):
         return True
-    report = Path(reference.path.replace("_ortho.tif", "_report.json"))
-    if report.suffix != ".json" or not report.is_file():
-        return False
-    try:
-        return bool(read_report(report).scene.name == image)
-    except InputError:
-        return False
+    report = report_of_ortho(reference.path)
+    return report is not None and report.scene.name == image
 
 
 def _agreement(matches: Matches) -> float:

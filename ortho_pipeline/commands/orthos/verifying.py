@@ -42,7 +42,7 @@ from ortho_pipeline.imaging.band_shifts import BandShift
 from ortho_pipeline.models.base import Array, solve_2x2
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
-from ortho_pipeline.report.document import read_report
+from ortho_pipeline.report.document import report_of_ortho
 from ortho_pipeline.report.orthos.page import write_page, write_table
 from ortho_pipeline.report.orthos.summary import summary_text, table_text
 from ortho_pipeline.report.stac import ortho_accuracy
@@ -192,16 +192,13 @@ class _Job:
 
 def _refuse_points_of_scene(points: Points, ortho: Scene) -> None:
     """Refuse points with the columns and rows of the scene that an ortho was made of, which its report lists."""
-    file = Path(str(ortho.path).replace("_ortho.tif", "_report.json"))
-    try:
-        found = read_report(file).adjustment.points if file.suffix == ".json" and file.is_file() else ()
-    except InputError:
-        return
-    of_scene = {point.id: point.image for point in found}
+    report = report_of_ortho(ortho.path)
+    of_scene = {point.id: point.image for point in report.adjustment.points} if report else {}
     both = [(at, of_scene[name]) for name, at in zip(points.ids, points.image, strict=True) if name in of_scene]
     if both and all(np.allclose(at, np.array(raw, float), rtol=0.0, atol=1e-3) for at, raw in both):
+        name = Path(ortho.path).name.replace("_ortho.tif", "_report.json")
         raise InputError(
-            f"these points were measured in the raw scene, not in the ortho: {file.name} has the same columns and rows",
+            f"these points were measured in the raw scene, not in the ortho: {name} has the same columns and rows",
             file=points.source or None,
             field="points.gcps",
             remedy="measure the points in the ortho ('ortho measure ORTHO') and give that file",

@@ -58,8 +58,10 @@ _PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img", ".png", ".jpg", ".j
 _RAW = (".dng", ".heic", ".heif", ".arw", ".cr2", ".cr3", ".nef", ".raf", ".orf", ".rw2")
 #: Files that are looked at, and folders below the given one.
 _MOST, _DEPTH = 2000, 3
-#: Fields that a file of points may leave to options, and what is said of a file without them.
-_TO_STATE, INCOMPLETE = ("points.crs", "points.vertical"), "incomplete: "
+#: A file of points need not state these fields: options can.
+_TO_STATE = "points.crs", "points.vertical"
+#: How the text on a file that lacks one of these fields begins.
+INCOMPLETE = "incomplete: "
 #: Images that a notice names.
 _NAMED = 10
 
