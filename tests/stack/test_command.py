@@ -94,6 +94,29 @@ def test_corrections_are_the_errors(made):
     assert 'data-plot="timeline"' in page
 
 
+@pytest.mark.parametrize("wrong", [0.0, 5.8])
+def test_pairs_of_three_dates_that_contradict_each_other_are_told(made, tmp_path, monkeypatch, wrong):
+    """One loop does not tell which of its three pairs is wrong."""
+
+    def displaced(path: Path) -> matching.EdgeMatches:
+        found = reads(path)
+        if {found.first, found.second} == {one.name for one in record.dates[1:3]}:
+            found = found.model_copy(update={"shown": tuple((x + wrong, y) for x, y in found.shown)})
+        return found
+
+    reads, record = matching.read_matches, StackRecord.read(json.loads((made[1] / "stack.json").read_text()))
+    monkeypatch.setattr(matching, "read_matches", displaced)
+    shutil.copytree(made[1], tmp_path / "out")
+    document = run(made[0][:3], tmp_path / "out").document
+    assert [one["code"] for one in document["notices"]] == (["stack-pairs-disagree"] if wrong else [])
+    # Each of the three pairs has a third of the contradiction.
+    true = RASTERS.shifts()[:3] - RASTERS.shifts()[:3].mean(axis=0)
+    error = np.array([one["shift_px"] for one in document["dates"]]) - true
+    sigma = np.array([one["sigma_px"] for one in document["dates"]])
+    assert np.abs(error[:, 0]).max() == pytest.approx(wrong / 3, abs=0.05)
+    assert (np.abs(error) < 3 * sigma).all()
+
+
 def test_matches_of_a_pair_share_an_error(made):
     """As `ortho verify` has it: 0.002 px of a chip, and 6 % of the noise of a match."""
     pairs = [json.loads(path.read_text()) for path in (made[1] / "pairs").glob("*.json") if "record" not in path.name]

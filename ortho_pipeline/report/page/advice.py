@@ -54,6 +54,7 @@ _LOOK: dict[str, str] = {
     ),
     "stack-not-connected": "Add dates between these and the others, or leave these out.",
     "stack-pairs-unmatched": Text("Give orthos with less cloud, or search farther with ", Setting("match.search"), "."),
+    "stack-pairs-disagree": "Add dates, so that more loops test each pair.",
     "stack-step": "Check whether the processing of the orthos changed then. The stack corrects the step.",
     "stack-mostly-moving": "Check that the area has stable ground, or stack a larger area.",
     "ortho-tested-in-part": "Add references that show the rest, or do not use the ortho there.",
