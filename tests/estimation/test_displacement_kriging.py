@@ -65,7 +65,17 @@ def test_draws_have_the_mean_and_the_covariance_of_universal_kriging():
         mean, root = found._kriged(axis, (0, RANGE), RATIOS[axis], NEW, root=True)
         expected, covariance = kriged(axis, NEW, EVERY)
         np.testing.assert_allclose(mean, expected, rtol=1e-9)
-        np.testing.assert_allclose(root @ root.T, covariance, rtol=0, atol=1e-9)
+        # A thousandth of the size of field and noise is added, so that the root exists where places are known.
+        np.testing.assert_allclose(root @ root.T, covariance + 1e-6 * (1 + RATIOS[axis]) * np.eye(3), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("shift", [0.0, 3.0])
+def test_displacements_that_are_all_the_same_have_a_field(shift):
+    """Without noise; drawn at the places of matches, of which two are at one place."""
+    place = np.vstack([PLACE, PLACE[:2]])
+    found = DisplacementField.of(PLACE, np.full((24, 2), shift), side=SIDE)
+    assert not found.local.any()
+    np.testing.assert_allclose(found.draws(place), shift, atol=1e-6)
 
 
 def test_the_trend_is_that_of_generalised_least_squares_in_the_units_of_places():

@@ -45,6 +45,8 @@ _FUNCTIONS, _OF_EACH = 50, 20
 _LOCAL = 4.5
 #: Part of the noise that chips share at one place; the rest is of each alone.
 _OF_PIXELS = 0.98
+#: Variance that is added to a field that is drawn, over that of field and noise: a thousandth of their size.
+_SMALL = 1e-6
 #: Rounds of leaving local displacements out.
 _ROUNDS = 3
 
@@ -283,8 +285,9 @@ class DisplacementField:
             return mean, np.zeros((0, 0))
         covariance = ratio * _covariance(kernel, self._distance(place, place)) - across.T @ across
         covariance += left @ linalg.cho_solve(normal, left.T)
-        values, vectors = np.linalg.eigh(covariance)
-        return mean, vectors * np.sqrt(np.maximum(values, 0.0))
+        # The field is known at places of matches: without this part of its variance the matrix is singular.
+        covariance += _SMALL * (1.0 + ratio) * np.eye(len(place))
+        return mean, linalg.cholesky(covariance, lower=True)
 
     def _constant(self, axis: int) -> float:
         """Return the chance that the trend of an axis has no slopes, by the information criterion of Schwarz.
@@ -299,7 +302,7 @@ class DisplacementField:
         for terms in (1, 3):
             part = design[:, :terms]
             squares.append(((value - part @ np.linalg.lstsq(part, value, rcond=None)[0]) ** 2).sum())
-        gain = len(value) * math.log(squares[0] / max(squares[1], 1e-300))
+        gain = len(value) * math.log(max(squares[0], 1e-300) / max(squares[1], 1e-300))
         return float(special.expit(math.log(max((design[:, 0] ** 2).sum(), 1.0)) - gain / 2))
 
     def _apart(self) -> Array:
@@ -313,7 +316,7 @@ class DisplacementField:
             inverse = inverse - design @ (design.T @ inverse)
             precision = (inverse**2).sum(axis=0)
             alone = inverse.T @ (inverse @ self.value[:, axis]) / precision
-            found += alone**2 * precision / (one.squares[one.best] / one.freedom)
+            found += alone**2 * precision / max(one.squares[one.best] / one.freedom, 1e-300)
         return found
 
 
@@ -358,7 +361,7 @@ def _likely(place: Array, value: Array, weight: Array, side: float) -> tuple[_Ax
     )
     design, seen = inverse @ _design(place), inverse @ value
     basis = np.linalg.qr(design, mode="complete")[0][:, design.shape[1] :]
-    left, freedom = basis.T @ seen, len(seen) - design.shape[1]
+    left, freedom, inverse = basis.T @ seen, len(seen) - design.shape[1], basis.T @ inverse
     whole = np.maximum((left**2).sum(axis=0) / freedom, 1e-300)
     distance = spatial.distance.cdist(place, place)
     near = float(np.median(np.partition(distance, 1, axis=1)[:, 1]))
@@ -368,8 +371,7 @@ def _likely(place: Array, value: Array, weight: Array, side: float) -> tuple[_Ax
     kernels = tuple((family, float(length)) for family in range(len(FAMILIES)) for length in ranges)
     logs, squares = (np.empty((2, len(kernels), len(ratios))) for _ in range(2))
     for number, (family, length) in enumerate(kernels):
-        kernel = inverse @ FAMILIES[family](between / length) @ inverse.T
-        values, vectors = np.linalg.eigh(basis.T @ kernel @ basis)
+        values, vectors = np.linalg.eigh(inverse @ FAMILIES[family](between / length) @ inverse.T)
         each = 1.0 + ratios[:, None] * np.maximum(values, 0.0)
         squares[:, number] = ((vectors.T @ left) ** 2).T @ (1.0 / each).T
         logs[:, number] = -0.5 * (np.log(each).sum(axis=1) + freedom * np.log(np.maximum(squares[:, number], 1e-300)))

@@ -82,17 +82,15 @@ class SmoothField(OverAnother):
 
     def displacement(self, image: ArrayLike) -> Array:
         """Return the field ``(N, 2)`` px at image points ``(N, 2)``; NaN where they are."""
+        from scipy.ndimage import map_coordinates  # takes a part of the start-up time of a command
+
         image = as_image(image)
-        place = np.clip(image, 0.0, self.size) / self.spacing
-        rows, columns = self.coefficients.shape[:2]
-        found = np.zeros((len(image), 2))
-        cell = np.nan_to_num(np.floor(place)).astype(int)
-        weights = [_weights(place[:, axis] - cell[:, axis]) for axis in (0, 1)]
-        for i in range(4):
-            row = np.clip(cell[:, 1] + i - 1, 0, rows - 1)
-            for j in range(4):
-                column = np.clip(cell[:, 0] + j - 1, 0, columns - 1)
-                found += (weights[1][i] * weights[0][j])[:, None] * self.coefficients[row, column]
+        rows, columns = (np.clip(np.nan_to_num(image), 0.0, self.size) / self.spacing).T[::-1]
+        found = np.empty((len(image), 2))
+        for axis in (0, 1):
+            # Without the prefilter the values are coefficients of B-splines; beyond the rim they are those of the rim.
+            of_axis = self.coefficients[..., axis]
+            found[:, axis] = map_coordinates(of_axis, (rows, columns), order=3, mode="nearest", prefilter=False)
         found[~np.isfinite(image).all(axis=1)] = np.nan
         return found
 
