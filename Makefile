@@ -40,7 +40,8 @@ VENV := .venv
 CONSTRAINTS := tools/constraints.txt
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
-WORKERS ?= 2
+# One more than the processors of a small machine: tests wait for browsers and other processes.
+WORKERS ?= 3
 IMAGE ?= python:3.13-slim
 N ?= 100000
 READER ?=
