@@ -41,7 +41,7 @@ class OutputOptions:
         Sequence[float] | None,
         Option(
             "--extent -te",
-            "Bounds of the ortho, used exactly.",
+            "Bounds of the ortho. The upper left corner is exact, then whole pixels follow.",
             "XMIN YMIN XMAX YMAX",
             kind="box",
             unset="the scene's footprint",

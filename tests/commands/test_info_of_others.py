@@ -44,6 +44,17 @@ def test_a_dem_says_what_it_is():
     assert 37.2 < document["corners_lon_lat"][0][1] < 37.3
 
 
+def test_a_raster_in_a_local_system_is_named(tmp_path):
+    path = picture(tmp_path / "site.tif")
+    made = gdal.Open(str(path), gdal.GA_Update)
+    made.SetProjection('LOCAL_CS["site",UNIT["metre",1]]')
+    made.SetGeoTransform((0, 1, 0, 0, 0, -1))
+    made = None
+    done = info(path)
+    assert done.exit_code == 2
+    assert done.output.startswith(f"Error: {path}: CRS: there is no transformation from 'site'")
+
+
 def test_an_ortho_says_what_it_is():
     done = info(SAMPLE / "reference.tif")
     assert done.exit_code == 0, done.output

@@ -10,7 +10,7 @@ import pyproj
 
 from ortho_pipeline.commands.results import SCHEMA_VERSION
 from ortho_pipeline.display.notices import to_document
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
@@ -40,7 +40,9 @@ def described(image: str | os.PathLike[str], dataset: Any) -> dict[str, Any]:
     left, along_x, over_x, top, along_y, over_y = dataset.GetGeoTransform()
     pixels = np.array([[0, 0], [size[0], 0], size, [0, size[1]]], dtype=float)
     corners = pixels @ [[along_x, along_y], [over_x, over_y]] + (left, top)
-    lon_lat = ground_transform(horizontal(crs), "EPSG:4979")(np.column_stack([corners, np.zeros(4)]))[:, :2]
+    with completed(image):
+        to_geographic = ground_transform(horizontal(crs), "EPSG:4979")
+    lon_lat = to_geographic(np.column_stack([corners, np.zeros(4)]))[:, :2]
     declared = declared_vertical(crs)
     heights = _range_of(band, str(image)) if kind == "dem" else None
     return {
