@@ -44,6 +44,24 @@ def test_sigmas_hold_and_dates_agree():
     assert np.quantile(misfit, 0.95) < 0.25
 
 
+@pytest.mark.parametrize("dates", [3, 4])
+def test_intervals_of_few_dates_hold_though_pairs_err_by_more_than_they_state(dates):
+    """Each pair errs by a shift. Pairs that agree by chance were kept, with sigmas that were 3 to 5 times too small."""
+    found = []
+    for seed in range(14):
+        made = Truth(seed=seed, dates=dates).made()
+        apart = np.random.default_rng(100 + seed).normal(0.0, 0.2, (len(made.edges), 1, 2))
+        stated = np.full(len(made.edges), 0.005)
+        edges = dataclasses.replace(made.edges, value=made.edges.value + apart, alike=stated)
+        stack = adjust(made.truth.cells, edges, made.years.tolist())
+        assert stack.determined.all()
+        found.append(errors(made, stack) / stack.sigma)
+    ratio = np.abs(np.concatenate(found))
+    # The errors of a stack have much in common: 14 stacks of three dates are about 28 independent values.
+    assert (ratio < 1.96).mean() > 0.85
+    assert np.median(ratio) > 0.1
+
+
 @pytest.mark.parametrize(("noise", "of_date", "of_edge"), [(0.15, 0.0, 0.0), (0.15, 0.05, 0.05), (0.05, 0.1, 0.1)])
 def test_errors_of_dates_and_of_edges_are_told_apart(noise, of_date, of_edge):
     """Half of the noise belongs to dates, half to edges; the smooth errors are as large as they were made."""

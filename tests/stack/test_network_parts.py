@@ -140,8 +140,10 @@ def test_many_loops_let_the_stated_error_shrink(usable, loops_):
     edges, *_ = loops()
     some = np.arange(11) < usable
     expected = -loops_ / (loops_ + 10) * edges.alike[:usable].min() ** 2
-    assert network._least(edges, edges.incidence(6), some) == pytest.approx(expected)
-    assert network._least(edges, edges.incidence(6), np.zeros(11, dtype=bool)) == 0.0
+    assert network._loops(edges.incidence(6), some) == loops_
+    assert network._least(edges, loops_, some) == pytest.approx(expected)
+    assert network._loops(edges.incidence(6), np.zeros(11, dtype=bool)) == 0
+    assert network._least(edges, 0, np.zeros(11, dtype=bool)) == 0.0
 
 
 def test_a_wrong_edge_leaves_and_what_loops_show_is_added():

@@ -36,7 +36,7 @@ from ortho_pipeline.report.stack.records import (
 
 #: Columns and rows of a chip.
 _CHIP = 128
-#: Pairs that err by more px than their matches show are told. What so few loops test can be wrong by more.
+#: Loops that leave more px (RMS) open are told.
 _APART = 0.5
 
 
@@ -231,9 +231,10 @@ def _notices(dates: Sequence[Dated], stack: AdjustedStack, matched: Sequence[Dat
     if len(matched) < 0.7 * tried:
         text = f"only {len(matched)} of {counted(tried, 'pair')} could be matched"
         found.append(Notice("stack-pairs-unmatched", text, matched=len(matched), pairs=tried))
-    apart = float(np.sqrt(max(stack.components.constant.max(), 0.0)))
+    closed = stack.closures.accepted & np.isfinite(stack.closures.ratio)
+    apart = float(np.sqrt((stack.closures.error[closed] ** 2).sum(axis=1).mean())) if closed.any() else 0.0
     if apart > _APART:
-        text = f"accepted pairs contradict each other by {apart:.1f} px, so one of them can be wrong"
+        text = f"accepted pairs contradict the other pairs by {apart:.1f} px (RMS), so one of them can be wrong"
         found.append(Notice("stack-pairs-disagree", text, error_px=apart))
     for step in stack.steps:
         size = float(np.hypot(*step.size))

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 from scipy.sparse import csgraph
-from scipy.stats import chi2
+from scipy.stats import chi2, norm, t
 
 from ortho_pipeline.block.stack.components import WAVES, ErrorComponents, season_correlation
 from ortho_pipeline.block.stack.edges import Edges
@@ -34,7 +34,7 @@ from ortho_pipeline.models.base import Array
 
 #: Chance that a right edge is rejected.
 CHANCE = 1e-4
-_START, _ROUNDS = 30, 5
+_START, _ROUNDS = 30, 12
 #: Part of the errors of its dates that an edge has in its weight, so that no weight is infinite.
 _LEAST = 0.1
 _LIMIT = float(chi2.isf(CHANCE, 2))
@@ -133,22 +133,27 @@ def accepted_edges(
     both = [components.covariance(axis, edges, _shifts(trends), place) for axis in (0, 1)]
     left = value - incidence @ _shortest(incidence, value, usable)
     total = np.array([one.diagonal() for one, _ in both]).T
-    constant = np.zeros(2)
-    if usable.any():
-        constant = np.median(left[usable] ** 2, axis=0) / chi2.median(1) - np.median(total[usable], axis=0)
-    least = _least(edges, incidence, usable)
+    constant, loops = np.zeros(2), _loops(incidence, usable)
+    if loops:
+        # As many edges as there are loops have anything left at all. More than half of these are right.
+        largest = np.sort(left[usable] ** 2, axis=0)[-loops:]
+        constant = largest[(loops - 1) // 2] / chi2.median(1) - np.median(total[usable], axis=0)
+    least = _least(edges, loops, usable)
     constant = np.maximum(constant, least)
     accepted = usable & ((left**2 / np.maximum(total + constant, 1e-12)).sum(axis=1) < _LIMIT)
     for _ in range(_ROUNDS):
         closures, more = _closed(edges, incidence, value, both, constant, accepted)
-        again = usable & np.where(np.isfinite(closures.ratio), closures.ratio <= _LIMIT, accepted)
-        better = np.maximum(constant + more, least)
-        settled = (again == accepted).all() and (np.abs(better - constant) < _SMALL * total.mean(axis=0)).all()
-        constant = better
-        if settled:
-            break
-        accepted = again
+        before, constant = constant, np.maximum(constant + more, least)
+        # Edges are tested with the error that the accepted ones have themselves.
+        if (np.abs(constant - before) < _SMALL * total.mean(axis=0)).all():
+            again = usable & np.where(np.isfinite(closures.ratio), closures.ratio <= _LIMIT, accepted)
+            if (again == accepted).all():
+                break
+            accepted = again
     accepted = accepted & ~_contradicted(edges, incidence, closures, accepted, usable & ~accepted)
+    # What few loops show is uncertain: 1.96 sigmas hold as often as Student's intervals.
+    freedom = max(_loops(incidence, accepted), 1)
+    constant = np.where(constant > 0, constant * (t.isf(0.025, freedom) / norm.isf(0.025)) ** 2, constant)
     return replace(closures, accepted=accepted), replace(components, constant=constant)
 
 
@@ -165,13 +170,15 @@ def _contradicted(
     return found
 
 
-def _least(edges: Edges, incidence: sparse.csr_matrix, usable: NDArray[np.bool_]) -> float:
-    """Return the least constant variance of edges: with many loops it may be less than stated."""
-    if not usable.any():
-        return 0.0
+def _loops(incidence: sparse.csr_matrix, usable: NDArray[np.bool_]) -> int:
+    """Return the number of independent loops of edges."""
     part = _parts(incidence, usable)
-    loops = int(usable.sum()) - len(part) + len(np.unique(part))
-    return -float(loops / (loops + _STATED) * edges.alike[usable].min() ** 2)
+    return int(usable.sum()) - len(part) + len(np.unique(part))
+
+
+def _least(edges: Edges, loops: int, usable: NDArray[np.bool_]) -> float:
+    """Return the least constant variance of edges: with many loops it may be less than stated."""
+    return -loops / (loops + _STATED) * float(edges.alike[usable].min(initial=np.inf)) ** 2 if loops else 0.0
 
 
 def _shifts(trends: Trends) -> Trends:
