@@ -36,7 +36,7 @@ from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.reliability.blunders import find_blunders
-from ortho_pipeline.block.reliability.known_points import notices, outlying
+from ortho_pipeline.block.reliability.known_points import doubtful_datums, notices, outlying
 from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.block.shared.common_error import BlockCommonError
 from ortho_pipeline.block.shared.priors import OWN, SharedPriors
@@ -420,6 +420,7 @@ def _result(
     used_ground = selection.ground & active
     covariance, of_points, of_others = unknowns.added(covariance)
     taken = None if heights is None else record_of(heights, solved)
+    camera = () if unknowns.priors is None else unknowns.priors.records
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
     ground_covariance = ground_covariance + of_others
@@ -449,7 +450,12 @@ def _result(
         shared_priors=unknowns.priors,
         rejected=rejected,
         outlying=doubts,
-        warnings=(*notices(doubts, points, object_residuals), *notes, *([] if taken is None else taken.notices())),
+        warnings=(
+            *notices(doubts, points, object_residuals),
+            *doubtful_datums(solved, object_residuals, ground_covariance, used_ground, camera),
+            *notes,
+            *([] if taken is None else taken.notices()),
+        ),
         condition=solved.condition,
         iterations=solved.iterations,
     )

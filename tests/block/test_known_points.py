@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ortho_pipeline.block.equations.problem import Pseudo
 from ortho_pipeline.block.reliability import known_points
-from ortho_pipeline.block.reliability.known_points import ContradictedPoint, notices, outlying
+from ortho_pipeline.block.reliability.known_points import ContradictedPoint, doubtful_datums, notices, outlying
 from ortho_pipeline.block.variances.components import Variances
 
 #: Two possible pairs of sigmas of ground that states none, of which three of four are 0.6 m and 1.5 m.
@@ -163,3 +164,56 @@ def test_control_that_is_exact_is_contradicted_by_its_measurements() -> None:
     assert exact.notice().startswith(
         "control point m3: its image measurements contradict its given position (4.6 sigma); the adjustment still uses"
     )
+
+
+# -- errors of a datum -------------------------------------------------------------------------------------------------
+
+
+def signs(
+    residuals: list[float], moved: list[float], focal: float = 100.0, stated: float = 0.1, used: int = 9
+) -> list[str]:
+    """Return the signs of a datum for heights of control (m) and of cameras (m) that state 1 m, and a focal length."""
+    count = len(residuals)
+    model = SimpleNamespace(param_names=("X_L", "Z_L"))
+    problem = SimpleNamespace(
+        points=SimpleNamespace(sigma_ground=np.full((count, 3), stated)),
+        pseudo=[
+            *(Pseudo(2 * k + 1, -height, 1.0) for k, height in enumerate(moved)),
+            Pseudo(0, 50.0, 1e-3, held=True),
+        ],
+    )
+    state = SimpleNamespace(models=[model] * len(moved), params=np.zeros(2 * len(moved)))
+    camera = SimpleNamespace(name="focal_length", value=focal, prior=SimpleNamespace(value=100.0, sigma=2.0))
+    found = doubtful_datums(
+        SimpleNamespace(problem=problem, state=state),  # type: ignore[arg-type]
+        np.column_stack([np.zeros((count, 2)), residuals]),
+        np.tile(np.eye(3), (count, 1, 1)),
+        np.arange(count) < used,
+        [camera],  # type: ignore[list-item]
+    )
+    assert {one.code for one in found} <= {"datum-doubtful"}
+    return [str(one).partition(":")[0] for one in found]
+
+
+def test_control_of_another_datum_is_told() -> None:
+    """Its heights differ alike: by more than three times their scatter, and than the accuracy of both."""
+    told = ["3 control points differ alike from the block, by +29.90 m in height (scatter 0.10 m)"]
+    assert signs([29.8, 29.9, 30.0, math.nan], [0.5, -1.0, 1.5], used=3) == told
+    assert signs([29.8, 29.9, 30.0], [0.0], stated=10.0) == []
+    assert signs([2.9, 2.9, 2.9], [0.0], stated=0.0) == []
+    assert signs([29.8, 10.0, 2.0], [0.0]) == []
+    assert signs([29.8, 29.9, 30.0], [0.0], used=2) == []
+
+
+def test_cameras_that_move_alike_are_told() -> None:
+    told = ["the adjustment moves the cameras alike, by -20.00 m in height (scatter 1.00 m)"]
+    assert signs([0.0], [-19.0, -20.0, -21.0]) == told
+    assert signs([0.0], [-2.9, -2.9, -2.9]) == []
+    assert signs([0.0], [-19.0, -1.0, -2.0]) == []
+    assert signs([0.0], [-19.0, -20.0]) == []
+
+
+def test_a_focal_length_that_stands_for_a_height_is_told() -> None:
+    told = ["the adjustment changes the focal length by -29.0%, although its accuracy is 2.0%"]
+    assert signs([0.0], [0.0], 71.0) == told
+    assert signs([0.0], [0.0], 105.9) == []

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.points import BlockPoints
+
 
 @pytest.fixture(scope="module")
 def flights(benchmark_module: Callable[[str], Any]) -> Any:
@@ -49,3 +52,34 @@ def test_an_error_of_any_cell_moves_the_mean_of_a_pair_by_its_share_of_the_overl
         between = np.nansum(one - other, axis=0)
         by_metre = base / (flights.GROUND_HEIGHT + flights.ABOVE - flights.height(flight.waves, *cell))
         assert np.linalg.norm(between) == pytest.approx(by_metre, rel=0.15)
+
+
+@pytest.mark.parametrize("off", [0.0, 30.0])
+def test_control_points_with_heights_of_another_datum_are_told(flights: Any, tmp_path: Path, off: float):
+    """Over flat ground they change the focal length."""
+    flight = flights.fly(flights.KINDS["exif"], 6, 2, tmp_path)
+    ties, poses = flight.points, list(zip(flight.positions, flight.turns, strict=True))
+    lonlat = np.array(flights.MIDDLE) + np.random.default_rng(1).uniform(-30, 30, (60, 2)) / (86_000.0, 111_000.0)
+    ground = np.column_stack([lonlat, flights.height(flight.waves, *lonlat.T)])
+    seen = np.array([flights.seen(flight.kind, *pose, flights.to_ecef(ground)) for pose in poses])
+    visible = np.isfinite(seen).all(axis=2)
+    shown = np.flatnonzero(visible.sum(axis=0) >= 3)[:5]
+    image, point = np.nonzero(visible[:, shown])
+    points = BlockPoints(
+        ids=(*ties.ids, *(f"g{k}" for k in shown)),
+        ground=np.vstack([ties.ground, ground[shown] + (0.0, 0.0, off)]),
+        roles=np.append(ties.roles, ["control"] * 5),
+        sigma_ground=np.vstack([ties.sigma_ground, np.full((5, 3), 0.05)]),
+        crs=ties.crs.to_3d(),
+        images=ties.images,
+        point=np.append(ties.point, point + len(ties)),
+        image=np.append(ties.image, image),
+        measured=np.vstack([ties.measured, seen[image, shown[point]]]),
+        sigma_image=np.append(ties.sigma_image, np.full(len(image), 0.3)),
+    )
+    models = {name: scene.model for name, scene in flight.scenes.items()}
+    priors = {name: scene.priors for name, scene in flight.scenes.items()}
+    fit = adjust(models, points, priors=priors)
+    found = [str(one) for one in fit.warnings if one.code == "datum-doubtful"]
+    assert len(found) == (off > 0)
+    assert all("focal length" in text for text in found)

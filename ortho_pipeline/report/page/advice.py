@@ -43,6 +43,17 @@ _LOOK: dict[str, str] = {
     "datum-unknown": Text(
         "State the height datum with ", Setting("scene.sensor_options", "DATUM", key="vertical"), "."
     ),
+    "datum-doubtful": Text(
+        "Check height datum and CRS of the points (",
+        Setting("points.vertical"),
+        ", ",
+        Setting("points.crs"),
+        "), of the cameras (",
+        Setting("scene.sensor_options", "DATUM", key="vertical"),
+        ") and of the DEM (",
+        Setting("surface.vertical"),
+        "), and the width of the sensor.",
+    ),
     "images-left-out": "If you need these images, repair what the message names.",
     "positions-differ": "If the position in use is wrong, remove it from the tags of the photo.",
     "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the ortho "
