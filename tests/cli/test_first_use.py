@@ -274,6 +274,11 @@ def test_points_of_several_images_are_listed_and_go_to_the_adjustment(tmp_path):
     said = run("info", tmp_path).stdout
     assert "incomplete: the height datum of these points is unknown" in said
     assert f"ortho adjust {tmp_path} --ties auto --dem {tmp_path / 'dem.tif'} --points {gcps} --orthos" in said
+    for number in (2, 3):
+        (tmp_path / f"photos/photo{number}.jpg").unlink()
+    said = run("info", tmp_path).stdout
+    assert "No control points found" not in said
+    assert f"ortho rectify {tmp_path / 'photos/photo1.jpg'} --dem {tmp_path / 'dem.tif'} --gcps {gcps} -o out" in said
     gcps.write_text("\n".join(["id,image,col,row", *(f"t1,photo{number}.jpg,100,200" for number in (1, 2))]))
     said = run("info", tmp_path).stdout
     assert "0 control points, 0 check points, 1 tie point in 2 images" in said

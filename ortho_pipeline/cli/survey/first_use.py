@@ -161,7 +161,8 @@ def _control_of(seen: FolderSurvey, scene: str, block: Sequence[str]) -> tuple[l
             "'--points-crs EPSG:n', '--points-vertical egm96', '--points-vertical egm2008' or "
             "'--points-vertical ellipsoid'."
         )
-        return [note] if incomplete else [], ["--points" if block else "--gcps", os.path.join(seen.folder, points[0])]
+        option = "--points" if block and len(seen.of("scene")) > 1 else "--gcps"
+        return [note] if incomplete else [], [option, os.path.join(seen.folder, points[0])]
     if maps:
         note = f"No control points found for {scene}. The command below matches them with {maps[0]}."
         return [note], ["--reference", os.path.join(seen.folder, maps[0])]
@@ -196,7 +197,7 @@ def next_steps(seen: FolderSurvey) -> list[str]:
             "'--dem-vertical egm2008' or '--dem-vertical ellipsoid'."
         )
     points = seen.beside(scenes[0], "points")
-    block = seen.beside(scenes[0], "block points") if len(scenes) > 1 else []
+    block = [] if points and len(scenes) == 1 else seen.beside(scenes[0], "block points")
     more, given = _control_of(seen, scenes[0], block)
     notes, words = [*notes, *more], [*words, *given]
     if len(scenes) == 1:
