@@ -36,7 +36,8 @@ from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.reliability.blunders import find_blunders
-from ortho_pipeline.block.reliability.known_points import doubtful_datums, notices, outlying
+from ortho_pipeline.block.reliability.datums import doubtful_datums
+from ortho_pipeline.block.reliability.known_points import notices, outlying
 from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.block.shared.common_error import BlockCommonError
 from ortho_pipeline.block.shared.priors import OWN, SharedPriors
@@ -112,8 +113,7 @@ def adjust(
     'position and height come from 9 control points'
     """
     chosen = models_of(models, points)
-    unknown = sorted(set(exclude) - set(points.ids))
-    if unknown:
+    if unknown := sorted(set(exclude) - set(points.ids)):
         raise InputError(f"cannot exclude {unknown[0]!r}: no point has this id", field="exclude")
     # Rays of a point next to each other, and points next to those of the same images: memory is read as it lies.
     order = Ordering.of(points, np.ones(points.rays, dtype=bool), points.control).rays
@@ -160,7 +160,8 @@ def adjust(
     notes += uncertain_images(solved, stated, shared.added(solved.cofactors)[0])
     fit = _result(solved, found, shared, inside, points, order, chosen, gauge, rejected, notes)
     adjusted = shared.adjusted_dem(fit.heights)
-    return replace(fit, planes=solved.problem.heights, adjusted_dem=adjusted, accuracies=stated_by)
+    warnings = (*fit.warnings, *doubtful_datums(fit, solved.problem.pseudo))
+    return replace(fit, warnings=warnings, planes=solved.problem.heights, adjusted_dem=adjusted, accuracies=stated_by)
 
 
 def _first(
@@ -420,7 +421,6 @@ def _result(
     used_ground = selection.ground & active
     covariance, of_points, of_others = unknowns.added(covariance)
     taken = None if heights is None else record_of(heights, solved)
-    camera = () if unknowns.priors is None else unknowns.priors.records
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
     ground_covariance = ground_covariance + of_others
@@ -450,12 +450,7 @@ def _result(
         shared_priors=unknowns.priors,
         rejected=rejected,
         outlying=doubts,
-        warnings=(
-            *notices(doubts, points, object_residuals),
-            *doubtful_datums(solved, object_residuals, ground_covariance, used_ground, camera),
-            *notes,
-            *([] if taken is None else taken.notices()),
-        ),
+        warnings=(*notices(doubts, points, object_residuals), *notes, *([] if taken is None else taken.notices())),
         condition=solved.condition,
         iterations=solved.iterations,
     )

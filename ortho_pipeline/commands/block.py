@@ -52,7 +52,7 @@ from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import together, write_json, write_text
-from ortho_pipeline.models import SensorModel
+from ortho_pipeline.models import FrameCamera, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import (
     BlockOptions,
@@ -342,7 +342,7 @@ def _record(
 def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     points = fit.points
     notices = [notice.in_image(label) for label, start in starts.items() for notice in start.scene.notices]
-    notices += fit.warnings
+    notices += (*fit.warnings, *_adjusted_again(fit, starts))
     ties = {points.ids[k] for k in np.flatnonzero(points.tie)}
     for rejected in sorted(fit.rejected, key=lambda one: one.point in ties)[:50]:
         where = f" in {rejected.image}" if rejected.image else (" (its ground)" if rejected.what == "ground" else "")
@@ -366,6 +366,16 @@ def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     if points.control.any() and checks < ENOUGH_CHECK_POINTS:
         notices.append(few_check_points(checks))
     return list(dict.fromkeys(notices))
+
+
+def _adjusted_again(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
+    """Return a notice of poses without an accuracy, such as those of a finished adjustment, that no control moved."""
+    if fit.points.control.any() or not fit.parameters:
+        return []
+    posed = [label for label, one in starts.items() if isinstance(one.model, FrameCamera) and not one.priors]
+    again = [label for label in posed if label in dict(fit.parameters)]
+    text = f"the poses of {counted(len(again), 'image')} state no accuracy. They were adjusted again"
+    return [Notice("adjusted-again", text, count=len(again), images=again[:10])] if again else []
 
 
 def _check_rms(fit: BlockFit) -> list[ObjectRms | Rmse | None]:

@@ -12,7 +12,8 @@ from scipy import stats
 
 from ortho_pipeline.block.equations.problem import Pseudo
 from ortho_pipeline.block.reliability import known_points
-from ortho_pipeline.block.reliability.known_points import ContradictedPoint, doubtful_datums, notices, outlying
+from ortho_pipeline.block.reliability.datums import doubtful_datums
+from ortho_pipeline.block.reliability.known_points import ContradictedPoint, notices, outlying
 from ortho_pipeline.block.variances.components import Variances
 
 #: Two possible pairs of sigmas of ground that states none, of which three of four are 0.6 m and 1.5 m.
@@ -174,23 +175,19 @@ def signs(
 ) -> list[str]:
     """Return the signs of a datum for heights of control (m) and of cameras (m) that state 1 m, and a focal length."""
     count = len(residuals)
-    model = SimpleNamespace(param_names=("X_L", "Z_L"))
-    problem = SimpleNamespace(
-        points=SimpleNamespace(sigma_ground=np.full((count, 3), stated)),
-        pseudo=[
-            *(Pseudo(2 * k + 1, -height, 1.0) for k, height in enumerate(moved)),
-            Pseudo(0, 50.0, 1e-3, held=True),
-        ],
-    )
-    state = SimpleNamespace(models=[model] * len(moved), params=np.zeros(2 * len(moved)))
+    names = [(f"p{k}", name) for k in range(len(moved)) for name in ("X_L", "Z_L")]
+    pseudo = [Pseudo(2 * k + 1, -height, 1.0) for k, height in enumerate(moved)]
     camera = SimpleNamespace(name="focal_length", value=focal, prior=SimpleNamespace(value=100.0, sigma=2.0))
-    found = doubtful_datums(
-        SimpleNamespace(problem=problem, state=state),  # type: ignore[arg-type]
-        np.column_stack([np.zeros((count, 2)), residuals]),
-        np.tile(np.eye(3), (count, 1, 1)),
-        np.arange(count) < used,
-        [camera],  # type: ignore[list-item]
+    fit = SimpleNamespace(
+        models={f"p{k}": SimpleNamespace(params=np.zeros(2)) for k in range(len(moved))},
+        points=SimpleNamespace(sigma_ground=np.full((count, 3), stated)),
+        ground_sigmas=np.ones((count, 3)),
+        object_residuals=np.column_stack([np.zeros((count, 2)), residuals]),
+        used_ground=np.arange(count) < used,
+        parameters=names,
+        shared_priors=SimpleNamespace(records=[camera]),
     )
+    found = doubtful_datums(fit, [*pseudo, Pseudo(0, 50.0, 1e-3, held=True)])  # type: ignore[arg-type]
     assert {one.code for one in found} <= {"datum-doubtful"}
     return [str(one).partition(":")[0] for one in found]
 

@@ -14,11 +14,12 @@ from photos import photo
 from scipy.spatial.transform import Rotation
 
 from ortho_pipeline import commands
+from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric, geodetic
-from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.options import BlockOptions, SceneOptions
 
 gdal.UseExceptions()
 LENS = {"projection_type": "perspective", "width": 60, "height": 40, "focal": 0.8, "k1": 0.0, "k2": 0.0}
@@ -87,6 +88,32 @@ def test_a_photo_of_a_project_has_the_axes_of_the_project(tmp_path, made, conver
     turned = math.degrees(math.atan(math.tan(math.radians(31.0 - 33.0)) * math.sin(math.radians(39.0))))
     assert heading(scene) == pytest.approx(turned if convergence else 0.0, abs=0.02)
     assert [notice.code for notice in scene.notices] == ["datum-unknown"]
+
+
+def test_poses_that_are_adjusted_again_are_told_once(tmp_path):
+    """They may be those of a finished adjustment, as of these projects."""
+    project(tmp_path, offset=False)
+    file = tmp_path / "opensfm" / "reconstruction.json"
+    document = json.loads(file.read_text())
+    shots = document[0]["shots"]
+    for number, name in enumerate(("two.tif", "three.tif"), 1):
+        moved = (-DOWN.apply(CENTRE + np.array([20.0 * number, 0.0, 0.0]))).tolist()
+        shots[name] = shots["one.tif"] | {"translation": moved}
+        photo(tmp_path / "images" / name, size=(60, 40))
+    file.write_text(json.dumps(document))
+    images = [tmp_path / "images" / name for name in shots]
+    options = SceneOptions(sensor_options={"vertical": "ellipsoid", "heights": "850,950"})
+    models = {image: open_scene(image, options).model for image in images}
+    place = models[images[1]].image_to_ground(np.random.default_rng(1).uniform((25, 5), (35, 35), (12, 2)), 900.0)
+    rows = ["id,image,col,row"]
+    for image, model in models.items():
+        rows += [f"t{k},{image.name},{c:.3f},{r:.3f}" for k, (c, r) in enumerate(model.ground_to_image(place))]
+    (tmp_path / "ties.csv").write_text("\n".join(rows))
+    for correction, codes in ((None, ["adjusted-again"]), ("none", [])):
+        block = BlockOptions(points=tmp_path / "ties.csv", correction=correction)
+        result = adjust(images, tmp_path / f"out{correction}", block, options)
+        notices = json.loads(result.files["report"].read_text())["notices"]
+        assert [one["code"] for one in notices if one["code"] == "adjusted-again"] == codes
 
 
 def test_the_exact_poses_of_a_project_are_preferred(tmp_path):

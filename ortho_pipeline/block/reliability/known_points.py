@@ -3,8 +3,6 @@
 Check points take no part with their ground, so nothing of theirs is ever left out; what is wrong with one of them
 spoils the accuracy that is stated. Control points with little influence can be far off without being rejected. Both are
 tested here against the covariance of the adjusted ground and the accuracy of their own, and said.
-
-Control points of another datum agree with each other. So what they have in common is tested, too.
 """
 
 from __future__ import annotations
@@ -20,21 +18,15 @@ from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.standardised_residuals import standardise_ground
-from ortho_pipeline.block.shared.priors import SharedParameterRecord
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import metres
-from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.blunders import FAR_ABOVE, NAMED, OUTLYING_RISK, are_alike, contradicting
 from ortho_pipeline.estimation.statistics import chance_of, rms
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.frame.orientation import EXTERIOR
 
 #: The least distance (m) that a text shows. The ground of control with a sigma of a millimetre cannot move so far.
 _SHOWN = 0.005
-#: Errors of so many points or more are alike if their mean is so many times their scatter and their accuracy.
-_ENOUGH, _ALIKE = 3, 3.0
 
 
 class ContradictedPoint(Record):
@@ -147,52 +139,6 @@ def notices(doubts: Sequence[ContradictedPoint], points: BlockPoints, residuals:
     }
     others = [one.notice() for one in doubts if one.role == "control" or one.point not in names[:NAMED]]
     return [Notice("checks-apart", text, **fields), *others]
-
-
-def doubtful_datums(
-    solved: Solved, residuals: Array, covariance: Array, used: Mask, camera: Sequence[SharedParameterRecord]
-) -> list[Notice]:
-    """Return a notice for each sign that points, cameras and DEM have different datums.
-
-    Control without a stated accuracy differs alike from the block. Other control moves the cameras alike, or changes
-    the focal length: over flat ground that is a height.
-
-    Parameters
-    ----------
-    residuals, covariance, used
-        As in `outlying`.
-    camera : sequence of SharedParameterRecord
-        What the images share.
-    """
-    points, params = solved.problem.points, solved.state.params
-    names = [name for model in solved.state.models for name in model.param_names]
-    of_points, of_cameras = [], []
-    for axis, (what, name) in enumerate(zip(("east", "north", "in height"), EXTERIOR[:3], strict=True)):
-        own = np.hypot(points.sigma_ground[:, axis], np.sqrt(covariance[:, axis, axis]))
-        rows = used & np.isfinite(residuals[:, axis] + own)
-        of_points += _alike(what, residuals[rows, axis], own[rows])
-        known = [one for one in solved.problem.pseudo if names[one.column] == name and not one.held]
-        moved = np.array([params[one.column] - one.mean for one in known])
-        of_cameras += _alike(what, moved, np.array([one.sigma for one in known]))
-    who = counted(int(used.sum()), "control point")
-    signs = [
-        *([f"{who} differ alike from the block, by {' and '.join(of_points)}"] if of_points else []),
-        *([f"the adjustment moves the cameras alike, by {' and '.join(of_cameras)}"] if of_cameras else []),
-    ]
-    for one in camera:
-        change = one.value - one.prior.value
-        if one.name == "focal_length" and abs(change) > _ALIKE * one.prior.sigma:
-            by = f"{change / one.prior.value:+.1%}, although its accuracy is {one.prior.sigma / one.prior.value:.1%}"
-            signs.append(f"the adjustment changes the focal length by {by}")
-    text = "points, cameras or DEM probably have another height datum or CRS than stated"
-    return [Notice("datum-doubtful", f"{sign}: {text}") for sign in signs]
-
-
-def _alike(what: str, errors: Array, sigmas: Array) -> list[str]:
-    """Return a text of the mean of errors ``(n,)`` m that are alike and beyond their sigmas; none for others."""
-    if len(errors) < _ENOUGH or abs(errors.mean()) <= _ALIKE * max(errors.std(ddof=1), rms(sigmas)):
-        return []
-    return [f"{errors.mean():+.2f} m {what} (scatter {metres(float(errors.std(ddof=1)))})"]
 
 
 def _both(rmse: Mapping[str, float]) -> str:

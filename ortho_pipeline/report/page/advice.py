@@ -148,6 +148,9 @@ _KNOW: dict[str, str] = {
     "heights-left-out": "Nothing to do: a DEM of the bare ground does not show roofs and trees.",
     "systematic-errors": "If the accuracy at check points suffices, nothing. If not, use more or better control "
     "points, a model with more parameters, or a better DEM if you used one.",
+    "adjusted-again": Text(
+        "If another program has adjusted these poses, keep them with ", Setting("points.correction", "none"), "."
+    ),
     "correction-by-matches": "Nothing to do, unless you know a better correction.",
     "dem-datum-overridden": "Check that your datum is right.",
     "no-rpc": "Nothing to do here. Give other programs the ortho or the model file.",
