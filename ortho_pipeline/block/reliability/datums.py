@@ -48,9 +48,9 @@ def doubtful_datums(fit: BlockFit, pseudo: Sequence[Pseudo]) -> list[Notice]:
     if of_cameras:
         signs.append(f"the adjustment moves the cameras alike, by {' and '.join(of_cameras)}")
     for one in () if fit.shared_priors is None else fit.shared_priors.records:
-        change = one.value - one.prior.value
-        if one.name == "focal_length" and abs(change) > _ALIKE * one.prior.sigma:
-            by = f"{change / one.prior.value:+.1%}, although its accuracy is {one.prior.sigma / one.prior.value:.1%}"
+        change, known_within = one.value - one.prior.value, one.prior.sigma or 0.0
+        if one.name == "focal_length" and abs(change) > _ALIKE * known_within:
+            by = f"{change / one.prior.value:+.1%}, although its accuracy is {known_within / one.prior.value:.1%}"
             signs.append(f"the adjustment changes the focal length by {by}")
     text = "points, cameras or DEM probably have another height datum or CRS than stated"
     return [Notice("datum-doubtful", f"{sign}: {text}") for sign in signs]
