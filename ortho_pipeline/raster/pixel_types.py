@@ -73,3 +73,25 @@ def read_type(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
     if wanted is None or pixel_type(wanted) == own:
         return own
     return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)
+
+
+def alpha_of(band: Any) -> Any | None:
+    """Return the alpha band that is the mask of a band, where GDAL makes none of it; else None.
+
+    GDAL does so in rasters of two and four bands alone.
+    """
+    dataset = band.GetDataset()
+    last = dataset.GetRasterBand(dataset.RasterCount)
+    alone = band.GetMaskFlags() == gdal.GMF_ALL_VALID and last.GetColorInterpretation() == gdal.GCI_AlphaBand
+    return last if alone else None
+
+
+def mask_flags(band: Any) -> int:
+    """Return GDAL's flags of the mask of a band."""
+    return int(band.GetMaskFlags()) if alpha_of(band) is None else gdal.GMF_PER_DATASET | gdal.GMF_ALPHA
+
+
+def mask_of(band: Any) -> Any:
+    """Return the mask of a band, as a band that is 0 where there is no value."""
+    alpha = alpha_of(band)
+    return band.GetMaskBand() if alpha is None else alpha

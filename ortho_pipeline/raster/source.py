@@ -31,7 +31,7 @@ from ortho_pipeline.files.shell import converted
 from ortho_pipeline.raster.caching.block_cache import keep_blocks
 from ortho_pipeline.raster.opening.drivers import DRIVERS, refuse_dataset_within
 from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
-from ortho_pipeline.raster.pixel_types import check_types, nodata_of, numpy_type, read_type
+from ortho_pipeline.raster.pixel_types import check_types, mask_flags, mask_of, nodata_of, numpy_type, read_type
 from ortho_pipeline.runtime.process_limits import require_memory
 from ortho_pipeline.stores.objects import stated_at
 
@@ -294,7 +294,7 @@ class _RasterFile:
         self.dtype = np.result_type(*(numpy_type(band.DataType) for band in bands))
         self.nodata = tuple(nodata_of(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)
-        every = [self._io(band.GetMaskFlags) for band in bands]
+        every = [self._io(mask_flags, band) for band in bands]
         # The mask of alpha is that of the other bands: an alpha band has none itself.
         lead = next((k for k, flags in enumerate(every) if flags & gdal.GMF_PER_DATASET), 0)
         flags, own = every[lead], 0 in every  # 0: a mask of this band alone
@@ -338,7 +338,7 @@ class _RasterFile:
                 if value is not None and not math.isnan(value):
                     np.not_equal(pixels[band], pixels.dtype.type(value), out=valid[band])
         if self._masked or self.validity in ("mask", "alpha"):
-            masks = [self.dataset.GetRasterBand(number).GetMaskBand() for number in self._mask_numbers]
+            masks = [mask_of(self.dataset.GetRasterBand(number)) for number in self._mask_numbers]
             mask = np.stack([self._io(mask.ReadAsArray, left, top, width, height) != 0 for mask in masks])
             valid = np.broadcast_to(mask, pixels.shape).copy() if valid is None else valid & mask
         if pixels.dtype.kind == "f":

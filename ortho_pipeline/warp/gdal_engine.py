@@ -37,7 +37,7 @@ from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
-from ortho_pipeline.raster.pixel_types import gdal_type
+from ortho_pipeline.raster.pixel_types import alpha_of, gdal_type, mask_flags
 from ortho_pipeline.raster.source import Grid, first_line
 from ortho_pipeline.raster.verified_writing import gdal_errors, written
 from ortho_pipeline.runtime.signals import called_by_gdal
@@ -205,8 +205,10 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
             scratch.callback(temporary.unlink, missing_ok=True)
         transformer = _standing(exact, job.exported, source.dataset, arrays, scratch)
         # Alpha that is no alpha of the ortho.
-        alpha = source.dataset.GetRasterBand(1).GetMaskFlags() & gdal.GMF_ALPHA and profile.validity != "alpha"
-        view = transformer.source(source.dataset, tuple(source.band_numbers), mask="mask,1" if alpha else None)
+        first = source.dataset.GetRasterBand(1)
+        alpha = mask_flags(first) & gdal.GMF_ALPHA and profile.validity != "alpha"
+        own = "mask,1" if (last := alpha_of(first)) is None else str(last.GetBand())
+        view = transformer.source(source.dataset, tuple(source.band_numbers), mask=own if alpha else None)
         with written(_create(target, profile, grid)) as ortho:
             _describe(ortho, profile)
             transformer.georeference(ortho, grid)

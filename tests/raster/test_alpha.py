@@ -54,6 +54,26 @@ def test_transparent_pixels_have_no_value_in_any_choice_of_bands(tmp_path, engin
 
 
 @pytest.mark.parametrize("engine", ["ortho", "gdal"])
+@pytest.mark.parametrize("bands", [(1, 2, 3, 4, 5), (1, 2, 3, 4), (2, 3, 4, 5), (4,)])
+def test_alpha_counts_beside_any_number_of_bands(tmp_path, engine, bands):
+    """GDAL makes a mask of alpha in rasters of two and four bands alone."""
+    pixels = write(tmp_path / "four.tif")
+    pixels = np.insert(pixels, 3, pixels[0] + 1, axis=0)
+    four = gdal.Open(str(tmp_path / "four.tif"))
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "image.tif"), SIDE, SIDE, 5)
+    made.SetGeoTransform(four.GetGeoTransform())
+    made.SetProjection(four.GetProjection())
+    made.WriteArray(pixels)
+    made.GetRasterBand(5).SetColorInterpretation(gdal.GCI_AlphaBand)
+    made = None
+    ortho = rectified(tmp_path, "-b", ",".join(map(str, bands)), "--engine", engine)
+    valid = ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
+    np.testing.assert_array_equal(valid, pixels[4] > 0)
+    chosen = pixels[np.array(bands) - 1]
+    np.testing.assert_array_equal(np.atleast_3d(ortho.ReadAsArray().T).T[..., valid], chosen[:, valid])
+
+
+@pytest.mark.parametrize("engine", ["ortho", "gdal"])
 @pytest.mark.parametrize("kind", ["UInt16", "Int16", "Float32"])
 def test_an_ortho_of_another_type_has_a_mask_and_keeps_the_values_of_alpha(tmp_path, engine, kind):
     pixels = write(tmp_path / "image.tif")
