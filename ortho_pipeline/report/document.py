@@ -20,7 +20,7 @@ from ortho_pipeline.display.drawing import round_down
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.display.pages import render
-from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
@@ -29,12 +29,13 @@ from ortho_pipeline.estimation.spatial.correlation import Covariances, analyse_f
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.json.records import DocumentError
 from ortho_pipeline.files.json.values import json_position, json_value
-from ortho_pipeline.geodesy.crs import Vertical, ground_transform
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.distortion import map_from_enu, metres_of_steps
 from ortho_pipeline.geodesy.ellipsoid import longitudes_near
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.points.control_hull import control_hull
+from ortho_pipeline.points.heights.datums import datums_apart, median_and_spread
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
@@ -60,8 +61,6 @@ from ortho_pipeline.report.wording import corrected, headline, points_again, ref
 from ortho_pipeline.surface.flat import FlatSurface
 
 if TYPE_CHECKING:
-    import pyproj
-
     from ortho_pipeline.exchange.rpc_fit import RpcExport
     from ortho_pipeline.hookspecs import Scene
     from ortho_pipeline.raster.source import Grid
@@ -70,8 +69,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Median of control height minus DEM height from which a difference of datums is suspected, metres.
-_SUSPICIOUS_HEIGHT = 5.0
 #: Typical difference between heights of points and of the surface beyond which the surface is not the ground, metres:
 #: twice the error that global DEMs state (90 %).
 _NOT_THE_GROUND = 20.0
@@ -259,20 +256,9 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
     if not len(difference):
         return None, []
     largest = int(np.abs(difference).argmax())
-    median = float(np.median(difference))
-    spread = float(1.4826 * np.median(np.abs(difference - median)))
-    doubts = []
-    if len(difference) >= 3 and abs(median) > max(_SUSPICIOUS_HEIGHT, 3 * spread):
-        displacement = seen["lean_m_per_m"]
-        moved = "" if displacement is None else f"; that moves the ortho by {metres(abs(median) * displacement)}"
-        side = "above" if median > 0 else "below"
-        text = (
-            f"the points lie {metres(abs(median))} {side} the DEM (median; spread {metres(spread)}): their heights "
-            f"probably have another datum than the DEM's{_undulation_there(points.ground, points.crs)}{moved}"
-        )
-        by = None if displacement is None else abs(median) * displacement
-        doubts = [Notice("heights-disagree", text, median_m=median, spread_m=spread, moved_m=by)]
-    elif surface.coverage(points.ground[:, :2], points.crs) < 1.0:
+    median, spread = median_and_spread(difference)
+    doubts = datums_apart(difference, points.ground, points.crs, seen["lean_m_per_m"])
+    if not doubts and surface.coverage(points.ground[:, :2], points.crs) < 1.0:
         doubts = _not_the_ground(difference, seen)
     warning = str(doubts[0]) if doubts else None
     heights = PointHeights(
@@ -305,16 +291,6 @@ def _not_the_ground(difference: Array, seen: Mapping[str, Any]) -> list[Notice]:
         f"is not the ground there{'' if moved is None else f'; that moves the ortho by {metres(moved)}'}"
     )
     return [Notice("surface-not-ground", text, typical_m=typical, worst_m=worst, moved_m=moved)]
-
-
-def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:
-    try:
-        there = ground_transform(crs, "EPSG:4979")(ground)
-        undulation = float(np.nanmean(Vertical.parse("egm96").undulation(there[:, 0], there[:, 1])))
-    except OrthoError:
-        return ""
-    side = "above" if undulation > 0 else "below"
-    return f" (the geoid is {metres(abs(undulation))} {side} the ellipsoid there)"
 
 
 def _ortho(grid: Grid, warp: WarpRecord | None) -> OrthoRecord:

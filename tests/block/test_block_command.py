@@ -699,3 +699,24 @@ def test_heights_of_a_dem_hold_a_pair_without_control(tmp_path: Path) -> None:
     code, document = adjusted("--dem-bias", "3")
     assert code == 2
     assert "--dem" in document["said"]
+
+
+def test_heights_of_points_and_dem_with_different_datums_are_told(
+    stereo: Stereo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Control without a stated accuracy gives way to the DEM, so its residuals alone look like poor control."""
+    plane = tmp_path / "dem.tif"
+    write_dem(plane, np.full((40, 40), 500.0), (LON - 0.05, LAT + 0.05), 0.0025, "EPSG:4326")
+    dem = ["--dem", str(plane), "--dem-vertical", "ellipsoid", "--dem-sigma", "500"]
+    for off, codes in ((0.4, []), (-33.0, ["heights-disagree"])):
+
+        def above(surface: Any, ground: np.ndarray, crs: Any, off: float = off) -> np.ndarray:
+            return off + 0.1 * np.sin(np.arange(len(ground)))
+
+        monkeypatch.setattr("ortho_pipeline.surface.dem.DemSurface.above", above)
+        out = tmp_path / str(off)
+        run("adjust", *stereo.images, "--points", stereo.write(), *dem, "-o", out)
+        document = json.loads((out / "block_report.json").read_text())
+        found = [one for one in document["notices"] if one["code"] == "heights-disagree"]
+        assert [one["code"] for one in found] == codes
+    assert found[0]["median_m"] == pytest.approx(-33.0, abs=0.1)

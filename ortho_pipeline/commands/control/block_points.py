@@ -29,6 +29,7 @@ from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions, numbers_of
 from ortho_pipeline.points import Points, assign_roles
+from ortho_pipeline.points.heights.datums import datums_apart
 from ortho_pipeline.points.heights.spot_heights import read_spot_heights
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface, moved
@@ -96,7 +97,18 @@ def gather(
     elif observes(options, surface):
         alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
         heights = _placed(open_surface(surface, scenes[0], under=alone), options, alone[0])
+    if options.points is not None:
+        notices += _between_datums(table, heights)
     return Gathered(joined(labels, tables), notices, document, text, heights)
+
+
+def _between_datums(points: BlockPoints, surface: Surface | None) -> list[Notice]:
+    """Return a notice if the heights of known points and of a DEM probably have different datums."""
+    known = (points.control | points.check) & np.isfinite(points.ground).all(axis=1)
+    if surface is None or not known.any():
+        return []
+    difference = surface.above(points.ground[known], points.crs)
+    return datums_apart(difference[np.isfinite(difference)], points.ground[known], points.crs)
 
 
 def settled_scenes(
