@@ -161,8 +161,10 @@ def test_thirty_per_cent_may_contradict_of_control_and_of_the_others(rejected: l
         # What takes no part is not counted, wherever it is named.
         _refuse_many(problem, None, [*rejected, 30, 31, 33, 34])  # type: ignore[arg-type]
         return
-    with pytest.raises(DegeneratePoints, match=refused):
+    with pytest.raises(DegeneratePoints, match=refused) as caught:
         _refuse_many(problem, None, rejected)  # type: ignore[arg-type]
+    # Control of another height datum contradicts the positions of cameras.
+    assert ("height datum" in str(caught.value.remedy)) is ("control" in refused)
 
 
 # -- a block -----------------------------------------------------------------------------------------------------------

@@ -220,5 +220,12 @@ def _refuse_many(problem: BlockProblem, selection: Selection, rejected: list[int
         Setting("points.ground_sigma", "XY,H"),
         " for ground that states none)",
     )
-    for what, mask in (("control point", active & points.control), ("tie and check point", active & ~points.control)):
-        refuse_many([points.ids[i] for i in rejected if mask[i]], int(mask.sum()), what, points.source, remedy)
+    # Control of another datum contradicts what is known of the models.
+    datum = Text("check their CRS and height datum (", Setting("points.crs"), ", ", Setting("points.vertical"), "), ")
+    for what, mask, first in (
+        ("control point", active & points.control, datum),
+        ("tie and check point", active & ~points.control, Text()),
+    ):
+        refuse_many(
+            [points.ids[i] for i in rejected if mask[i]], int(mask.sum()), what, points.source, Text(first, remedy)
+        )
