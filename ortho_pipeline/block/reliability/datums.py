@@ -5,6 +5,7 @@ Control points of another datum agree with each other, so none of them is a gros
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -48,7 +49,7 @@ def doubtful_datums(fit: BlockFit, pseudo: Sequence[Pseudo]) -> list[Notice]:
     if of_cameras:
         signs.append(f"the adjustment moves the cameras alike, by {' and '.join(of_cameras)}")
     for one in () if fit.shared_priors is None else fit.shared_priors.records:
-        change, known_within = one.value - one.prior.value, one.prior.sigma or 0.0
+        change, known_within = one.value - one.prior.value, one.prior.sigma or math.inf
         if one.name == "focal_length" and abs(change) > _ALIKE * known_within:
             by = f"{change / one.prior.value:+.1%}, although its accuracy is {known_within / one.prior.value:.1%}"
             signs.append(f"the adjustment changes the focal length by {by}")
