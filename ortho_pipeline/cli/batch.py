@@ -220,20 +220,23 @@ def _print_summary(result: BatchResult) -> None:
     for scene in scenes:
         table.add_row(*map(printable, _row(scene)))
     if scenes:
-        console.print(table)
+        with console.capture() as drawn:
+            console.print(table)
+        # rich ends the process where the reader of a pipe has left, which a command takes for a fault.
+        click.echo(drawn.get(), nl=False)
     for scene in scenes:
         if scene.error:
-            console.print(printable(f"\nError: {scene.name}: {_error_text(scene.error)}"), markup=False)
+            say(f"\nError: {scene.name}: {_error_text(scene.error)}")
         elif against := refuted(scene.facts.get("notices", ())):
-            console.print(printable(f"\nError: {scene.name}: accuracy unknown: {against}"), markup=False)
+            say(f"\nError: {scene.name}: accuracy unknown: {against}")
     counts = ", ".join(
         f"{result.count(status)} {status}"
         for status in ("done", "unchanged", "failed", "missing")
         if status != "missing" or result.count(status)
     )
-    console.print(f"\n{counted(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
+    say(f"\n{counted(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
     if result.mosaic:
-        console.print(printable(_mosaic_text(result.mosaic)), markup=False)
+        say(_mosaic_text(result.mosaic))
     print_files(result.files)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -85,3 +86,18 @@ def test_an_error_of_a_stdout_that_takes_nothing_is_a_message() -> None:
         done = subprocess.run(["sh", "-c", line], check=False, capture_output=True, text=True)
         assert (done.returncode, done.stderr[: len(message)]) == (code, message)
         assert "Traceback" not in done.stderr
+
+
+def test_a_reader_who_has_left_is_no_fault_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # As in `ortho run pipeline.yaml | head -1`.
+    (tmp_path / "a.tif").write_text("no image")
+    (tmp_path / "p.yaml").write_text("scenes:\n  - {image: a.tif, surface: {height: 10.0}}\n")
+    typed = ["run", str(tmp_path / "p.yaml"), "--executor", "sequential"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    left = os.fdopen(writer, "w")
+    with contextlib.redirect_stdout(left), pytest.raises(SystemExit, match="1"):
+        cli.main(typed, standalone_mode=False)
+    assert "bug" not in capsys.readouterr().err
+    with contextlib.suppress(BrokenPipeError):
+        left.close()
