@@ -298,3 +298,20 @@ def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str =
             os.lseek(lock.descriptor, 0, os.SEEK_SET)
             os.write(lock.descriptor, owner.encode())
         yield
+
+
+def require_lock(path: Path) -> None:
+    """Refuse work in a folder without the lock of the run: a worker on another machine may have one of its own here.
+
+    Raises
+    ------
+    InputError
+        If the lock is not there, or cannot be seen.
+    """
+    if not os.path.isfile(path):
+        raise InputError(
+            "this worker does not have the output folder of the run",
+            file=path.parent.parent,
+            field="output",
+            remedy="share one folder, at the same path, with all workers",
+        )

@@ -32,7 +32,7 @@ from ortho_pipeline.batch.freshness import (
     untouched,
 )
 from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan
-from ortho_pipeline.batch.records import FileState, RunRecord, key_of, locked, siblings
+from ortho_pipeline.batch.records import FileState, RunRecord, key_of, locked, require_lock, siblings
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
 from ortho_pipeline.batch.summary import paths_of, provenance_of
@@ -472,14 +472,7 @@ class _Mosaic:
 
 
 def _make_in_run(job: Job, checksums: bool) -> Outcome:
-    # A worker on another machine may have a folder of its own at this path.
-    if not os.path.isfile(job.output / _RUN_LOCK):
-        raise InputError(
-            "this worker does not have the output folder of the run",
-            file=job.output,
-            field="output",
-            remedy="share one folder, at the same path, with all workers",
-        )
+    require_lock(job.output / _RUN_LOCK)
     if checksums:
         # A process of the caller, or of a cluster, may know checksums of earlier runs.
         DIGESTS.renew(job.run)

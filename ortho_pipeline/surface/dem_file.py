@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -147,7 +148,8 @@ class DemFile:
     _local: threading.local = field(default_factory=threading.local, init=False, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return DemFile, (self.path, self.access)
+        # Workers elsewhere have another working folder.
+        return DemFile, (os.path.abspath(self.path) if os.path.isfile(self.path) else self.path, self.access)
 
     @property
     def dataset(self) -> gdal.Dataset:

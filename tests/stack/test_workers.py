@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -10,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ from test_raw import delivered
 from ortho_pipeline.batch import freshness
 from ortho_pipeline.batch.records import FileState, RunRecord
 from ortho_pipeline.batch.stack.command import match_part, stack
-from ortho_pipeline.batch.stack.recorded import FileSet
+from ortho_pipeline.batch.stack.recorded import FileSet, recorded_in
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
@@ -228,6 +230,35 @@ def test_workers_with_other_software_are_refused(
     with pytest.raises(InputError, match=r"different software versions: gdal 1\.0 instead of"):
         stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
     assert not list(tmp_path.rglob("*.record.json"))
+
+
+def test_a_worker_with_another_working_folder_reads_and_writes_the_same_files(
+    made: tuple[Path, dict[str, bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Elsewhere(ThreadPoolExecutor):
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
+            with contextlib.chdir(tmp_path):
+                future = super().submit(fn, *args, **kwargs)
+                wait([future])
+            return future
+
+    monkeypatch.chdir(made[0])
+    with Elsewhere(1) as pool:
+        part = match_part(["in"], "elsewhere", (6, 6), executor=pool, **SETTINGS)
+    assert part.document["matched"] == 1
+    assert (made[0] / "elsewhere" / "pairs").is_dir()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_worker_without_the_folders_makes_nothing(tmp_path: Path) -> None:
+    """Otherwise it would write into a folder of its own, and record that images cannot be matched."""
+    state = FileState(role="image", path=str(tmp_path / "a.tif"), bytes=1, mtime_ns=0, sha256="0" * 64)
+    pair = FileSet("pair", (state,), {}, {"matches": "pair.json"}, lambda folder: None, may_fail=True)
+    with pytest.raises(InputError, match=r"a\.tif: this worker does not have this input"):
+        pair.made(tmp_path)
+    with pytest.raises(InputError, match="does not have the output folder of the run"):
+        recorded_in(tmp_path / "out", "pairs", False, False).make(pair)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_record_is_that_of_a_set_only_with_its_outputs(tmp_path: Path) -> None:

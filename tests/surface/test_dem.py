@@ -679,3 +679,14 @@ def test_a_real_srtm_tile(real: Path, opener: Callable[[Path], Path]) -> None:
     lon, lat = np.meshgrid(np.linspace(5.25, 5.31, 60), np.linspace(44.15, 44.2, 60))
     peak = np.nanmax(surface.heights(np.column_stack([lon.ravel(), lat.ravel()]), "EPSG:4326"))
     assert 1880 < peak - Vertical.parse("egm96").undulation([5.28], [44.17])[0] < 1915
+
+
+def test_a_worker_with_another_working_folder_gets_the_same_dem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    global_dem(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    sent = pickle.dumps(open_dem("world.tif", "ellipsoid"))
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path / "other")
+    assert np.isfinite(pickle.loads(sent).heights(np.array([[33.0, 10.0]]))).all()

@@ -21,7 +21,7 @@ from ortho_pipeline.batch.stack.items import items_of, write_items
 from ortho_pipeline.batch.stack.matching import DatePair, Matcher
 from ortho_pipeline.batch.stack.placing import Placed, map_grid_of, pixel_of, require_one_crs
 from ortho_pipeline.batch.stack.raw import Levelled, Rectifier
-from ortho_pipeline.batch.stack.recorded import RecordedFolder, recorded_in
+from ortho_pipeline.batch.stack.recorded import LOCK, RecordedFolder, recorded_in
 from ortho_pipeline.batch.stack.result import StackResult, part_summary, summary
 from ortho_pipeline.batch.stack.writing import Writer
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
@@ -43,7 +43,7 @@ from ortho_pipeline.runtime.process_limits import Progress, one_blas_thread
 from ortho_pipeline.stores.delivery import address_of, delivered
 from ortho_pipeline.stores.objects import Objects
 
-_EDGES, _ALIGNED, _RAW = "pairs", "aligned", "raw"
+_EDGES, _ALIGNED, _RAW = LOCK.parent.name, "aligned", "raw"
 _DAYS_A_YEAR = 365.25
 #: What the items are called together in object storage.
 _ITEMS = "items"
@@ -208,7 +208,8 @@ class _Planned:
         if len(nodes) > len(dates):
             wanted += [(date, len(dates)) for date in range(len(dates))]
         told = progress or (lambda what, share: None)
-        place = os.fspath(folder).rstrip("/") if address_of(folder) is not None else os.fspath(folder)
+        # Workers elsewhere have another working folder.
+        place = os.fspath(folder).rstrip("/") if address_of(folder) is not None else os.path.abspath(folder)
         return cls(nodes, len(dates), fixed, wanted, place, options, match, surface, scene, output, told)
 
     def with_threads(self, threads: int | None) -> _Planned:
@@ -270,7 +271,7 @@ def _held(folder: str, *, shared: bool) -> Iterator[None]:
     if address_of(folder) is not None:
         yield
         return
-    with locked(Path(folder) / _EDGES / ".lock", shared=shared, owner="ortho stack"):
+    with locked(Path(folder) / LOCK, shared=shared, owner="ortho stack"):
         yield
 
 

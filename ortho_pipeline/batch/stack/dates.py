@@ -180,7 +180,8 @@ def placed_at(name: str | os.PathLike[str], options: SceneOptions) -> Place:
         If it is on another machine, and the network is not allowed.
     """
     found = located(name, allow_network=options.allow_network)
-    return found if isinstance(found, VsiPath) else Path(found)
+    # Workers elsewhere have another working folder.
+    return found if isinstance(found, VsiPath) else Path(os.path.abspath(found))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ortho_pipeline.batch.executors import Crew, completed
 from ortho_pipeline.batch.freshness import DIGESTS, change_in_store, recorded_at, require_versions
 from ortho_pipeline.batch.paths import key_of_name
 from ortho_pipeline.batch.plan import STATE
-from ortho_pipeline.batch.records import MAX_BYTES, FileState, RunRecord, key_of, locked
+from ortho_pipeline.batch.records import MAX_BYTES, FileState, RunRecord, key_of, locked, require_lock
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files import clear_up
@@ -28,6 +28,8 @@ from ortho_pipeline.stores.objects import Objects
 
 #: No file of a stack is larger (bytes).
 LARGEST = 1 << 42
+#: The lock of a stack within its folder.
+LOCK = Path("pairs", ".lock")
 #: How the names of records end.
 _RECORD = ".record.json"
 
@@ -74,6 +76,7 @@ class FileSet:
     def made(self, folder: Path) -> RunRecord:
         """Write the files into a folder, and return their record."""
         require_versions(self.software)
+        self._require_inputs()
         record = RunRecord(name=self.name, key=self.key, status="failed", inputs=self.inputs)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -85,6 +88,16 @@ class FileSet:
             return record.replaced(error=error_document(error))
         outputs = tuple(FileState.of(role, folder / name, name=name) for role, name in self.files.items())
         return record.replaced(status="done", outputs=outputs)
+
+    def _require_inputs(self) -> None:
+        """Refuse to make it without an input: that would be recorded as a failure of the images."""
+        lost = next((state for state in self.inputs if not state.tag and not os.path.isfile(state.path)), None)
+        if lost is not None:
+            raise InputError(
+                "this worker does not have this input",
+                file=lost.path,
+                remedy="give all workers the inputs, at the same path",
+            )
 
 
 class Made(NamedTuple):
@@ -191,6 +204,7 @@ class RecordedFolder:
             if self.is_far:
                 return self._make_far(one)
             folder = Path(self.place)
+            require_lock(folder.parent / LOCK)
             with locked(folder / STATE / f"{one.name}.lock", wait=True):
                 kept = self._kept(one)
                 if kept is not None:
