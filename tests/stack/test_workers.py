@@ -21,11 +21,13 @@ from click.testing import CliRunner
 from osgeo import gdal
 from rasters import Rasters
 from servers import moto_server, serving
+from test_dates import ortho
 from test_raw import delivered
 
 from ortho_pipeline.batch import freshness
 from ortho_pipeline.batch.records import FileState, RunRecord
 from ortho_pipeline.batch.stack.command import match_part, stack
+from ortho_pipeline.batch.stack.dates import dated_orthos
 from ortho_pipeline.batch.stack.recorded import FileSet, recorded_in
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
@@ -206,6 +208,25 @@ def test_a_folder_of_a_bucket_is_a_stack(made: tuple[Path, dict[str, bytes]], bu
     assert not names
     with pytest.raises(InputError, match="cannot refer to an image on this machine"):
         stack([made[0] / "in"], bucket, StackOptions(corrections_only=True), **FAR)
+
+
+def test_a_folder_of_items_in_a_bucket_is_their_images(bucket: str, tmp_path: Path) -> None:
+    store = Objects("s3://stacks", allow_network=True)
+    names = {"relative": "../data/relative/B04.tif", "absolute": "s3://stacks/data/absolute/B04.tif"}
+    for day, (name, href) in enumerate(names.items(), start=1):
+        store.put(f"data/{name}/B04.tif", ortho(tmp_path / f"{name}.tif"))
+        item: dict[str, Any] = {"type": "Feature", "stac_version": "1.0.0", "id": name}
+        item["properties"] = {"datetime": f"2024-05-0{day}T00:00:00Z"}
+        item["assets"] = {"B04": {"href": href}, "B08": {"href": "none.tif"}}
+        store.put(f"every/{name}.json", json.dumps(item).encode())
+        item["assets"] = {"B04": {"href": href}}
+        store.put(f"items/{name}.json", json.dumps(item).encode())
+    store.put("items/collection.json", b'{"type": "Collection", "stac_version": "1.0.0"}')
+    for given in ("items/", "items", "items/*.json", "every/*.json#B04"):
+        found = dated_orthos([f"s3://stacks/{given}"], options=SceneOptions(allow_network=True))
+        assert [(one.name, one.time.day) for one in found] == [("relative_B04", 1), ("absolute_B04", 2)]
+    with pytest.raises(InputError, match="several assets could be the image"):
+        dated_orthos(["s3://stacks/every/"], options=SceneOptions(allow_network=True))
 
 
 @pytest.mark.slow

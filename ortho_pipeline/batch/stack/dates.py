@@ -172,7 +172,7 @@ def dated_orthos(
 
 
 def placed_at(name: str | os.PathLike[str], options: SceneOptions) -> Place:
-    """Return the place of a file that a user names: a path, or one in an archive or behind a URL.
+    """Return the place of a file that a user names: a path, which other workers understand, or an address.
 
     Raises
     ------
@@ -180,7 +180,6 @@ def placed_at(name: str | os.PathLike[str], options: SceneOptions) -> Place:
         If it is on another machine, and the network is not allowed.
     """
     found = located(name, allow_network=options.allow_network)
-    # Workers elsewhere have another working folder.
     return found if isinstance(found, VsiPath) else Path(os.path.abspath(found))
 
 
@@ -252,9 +251,7 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
             continue
         path = placed_at(name.document if name.is_item else name, options)
         if path.is_dir():
-            inside: list[Place] = sorted(path.iterdir(), key=str)
-            images = [_Given(file) for file in inside if file.suffix.lower() in RASTERS]
-            found += images or [_one(Location(file), options) for file in inside if is_item_file(file)]
+            found += _among(sorted(path.iterdir(), key=str), options)
         elif path.suffix.lower() in (".csv", ".txt") and path.is_file():
             found += _listed(path, options)
         elif not path.exists() and any(mark in name for mark in "*?["):
@@ -262,9 +259,8 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
             if not matches:
                 raise InputError("no file has such a name", file=path, field="orthos", remedy="check the pattern")
             # A pattern such as scenes/* has side-cars, too.
-            rasters = [file for file in matches if Path(file).suffix.lower() in RASTERS]
-            asset = f"#{name.asset}" if name.asset else ""
-            found += [_one(Location(f"{file}{asset}"), options) for file in rasters or matches]
+            rasters, asset = [file for file in matches if Path(file).suffix.lower() in RASTERS], name.asset
+            found += [_one(Location(f"{file}#{asset}" if asset else file), options) for file in rasters or matches]
         else:
             found.append(_one(name, options))
     ask_beside(*(one.path for one in found), allow_network=options.allow_network)
@@ -273,19 +269,25 @@ def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> li
 
 def _far_files(address: Location, options: SceneOptions) -> list[_Given]:
     """Return the images of an address: of an image, a STAC item, a list, a folder or pattern in object storage."""
-    ending = Path(address).suffix.lower()
-    if ending in (".csv", ".txt"):
+    if (ending := Path(address).suffix.lower()) in (".csv", ".txt"):
         return _listed(placed_at(address, options), options)
     # A web server has no patterns, and a query follows a question mark.
-    is_pattern = not address.is_on_web and any(mark in address for mark in "*?[")
-    if address.is_item or (not is_pattern and (address.is_on_web or (ending and not address.endswith("/")))):
+    is_pattern = not address.is_on_web and any(mark in address.document for mark in "*?[")
+    if not is_pattern and (address.is_item or address.is_on_web or (ending and not address.endswith("/"))):
         return [_one(address, options)]
-    pattern = address if is_pattern else f"{address.rstrip('/')}/*"
-    paths = PipelinePaths(address, None, options.allow_network).matching(pattern, "orthos")
-    images = [path for path in paths if path.suffix.lower() in RASTERS]
-    if not images:
-        raise InputError("no image has such an address", file=address, field="orthos", remedy="check the address")
-    return [_Given(path) for path in images]
+    pattern = address.document if is_pattern else f"{address.rstrip('/')}/*"
+    matches = PipelinePaths(address, None, options.allow_network).matching(pattern, "orthos")
+    if found := _among(matches, options, address.asset):
+        return found
+    raise InputError("no image has such an address", file=address, field="orthos", remedy="check the address")
+
+
+def _among(files: Sequence[Place], options: SceneOptions, asset: str = "") -> list[_Given]:
+    """Return the images among some files; without any, those of the STAC items, or an asset of each."""
+    if images := [_Given(file) for file in files if file.suffix.lower() in RASTERS]:
+        return images
+    items = [Location(file).url for file in files if is_item_file(file, allow_network=options.allow_network)]
+    return [_one(Location(f"{item}#{asset}" if asset else item), options) for item in items]
 
 
 def _one(name: Location, options: SceneOptions) -> _Given:

@@ -191,7 +191,7 @@ def read_item(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPat
     return item_of(read_document(path, allow_network=allow_network), path, roots)
 
 
-def is_item_file(path: AnyPath) -> bool:
+def is_item_file(path: AnyPath, *, allow_network: bool = False) -> bool:
     """Return whether a file is a STAC item, and no collection, GeoJSON or other JSON.
 
     Raises
@@ -199,7 +199,7 @@ def is_item_file(path: AnyPath) -> bool:
     InputError
         If its name is that of a JSON file, and it cannot be read.
     """
-    return Location(path).is_item and _is_item(read_document(path, allow_network=False))
+    return Location(path).is_item and _is_item(read_document(path, allow_network=allow_network))
 
 
 @reads(REMEDY)
