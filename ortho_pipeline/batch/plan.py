@@ -271,15 +271,9 @@ class _Planner:
             options[key] = self._perhaps_file(text, image, f"{where}.scene.sensor_options.{key}")
         rpc = scene.rpc if scene.rpc in ("tag", "sidecar") else self._file(scene.rpc, image, f"{where}.scene.rpc")
         model = self._file(scene.model, image, f"{where}.scene.model")
-        return SceneOptions(
-            sensor=scene.sensor,
-            rpc=rpc,
-            model=model,
-            sensor_options=options,
-            crop_offset=scene.crop_offset,
-            roots=() if self.places.far else (str(self.places.root),),
-            allow_network=self.places.allow_network,
-        )
+        files = {"rpc": rpc, "model": model, "sensor_options": options}
+        roots = () if self.places.far else (str(self.places.root),)
+        return SceneOptions(**{**dict(scene), **files}, roots=roots, allow_network=self.places.allow_network)
 
     def _points(self, settings: Settings, image: Place, where: str) -> PointOptions:
         values, match = dict[str, Any](settings.points), dict[str, Any](settings.match)

@@ -350,6 +350,13 @@ def test_a_file_of_the_current_folder_is_not_meant(block, tmp_path, monkeypatch)
     assert options == {"camera": str(block.folder / "camera.json"), "band": "2", "all": "true"}
 
 
+def test_a_finished_ortho_is_a_scene_if_the_file_says_so(block):
+    block.write(FILE + "    scene: {ortho: true, crop_offset: [3, 4]}\n")
+    scene = batch_plan.plan(block.file).jobs[0].request.scene
+    assert scene.ortho
+    assert tuple(scene.crop_offset) == (3, 4)
+
+
 @pytest.mark.parametrize("record", ["one.json", "mosaic/record.json"])
 def test_what_a_killed_run_left_beside_a_record_goes_though_the_scene_is_unchanged(block, record):
     """Killed between the rename of the record and the removal of its lock, as a run was by `make faults`."""
