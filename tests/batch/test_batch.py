@@ -350,6 +350,13 @@ def test_a_file_of_the_current_folder_is_not_meant(block, tmp_path, monkeypatch)
     assert options == {"camera": str(block.folder / "camera.json"), "band": "2", "all": "true"}
 
 
+def test_images_in_the_output_folder_are_not_said_to_be_missing(block):
+    block.write("output: raw\n" + FILE)
+    with pytest.raises(InputError, match="only files in the output folder match 'raw") as caught:
+        batch_plan.plan(block.file)
+    assert str(caught.value.remedy) == "choose another output folder"
+
+
 def test_a_finished_ortho_is_a_scene_if_the_file_says_so(block):
     block.write(FILE + "    scene: {ortho: true, crop_offset: [3, 4]}\n")
     scene = batch_plan.plan(block.file).jobs[0].request.scene
