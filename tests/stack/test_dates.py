@@ -215,3 +215,10 @@ def test_the_state_of_an_ortho_behind_a_url_has_its_side_cars(tmp_path):
         access = SceneOptions(allow_network=True)
         first = dated_orthos([tmp_path / "list.csv"], options=access)[0]
         assert [Path(state.path).name for state in first.states(access)] == ["a.tif", "a.tif.msk"]
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"seris: there is no such file"):
+        dated_orthos([tmp_path / "seris"])
+    with pytest.raises(InputError, match="at least two images, not 0"):
+        dated_orthos([tmp_path])

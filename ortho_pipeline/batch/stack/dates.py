@@ -146,12 +146,6 @@ def dated_orthos(
     """
     heights, skipped = has_surface(surface), {_real(path) for path in dem_files(surface)}
     found = _each_once(one for one in _files(given, options) if _real(one.path) not in skipped)
-    if len(found) < 2:
-        raise InputError(
-            f"a stack needs at least two images, not {len(found)}",
-            field="orthos",
-            remedy=f"give a folder with orthos ({', '.join(RASTERS)}) or STAC items",
-        )
     dated = []
     for one in found:
         path = one.path
@@ -168,6 +162,12 @@ def dated_orthos(
         facts = [*(_facts_of(document) for document, _ in documents), scene.facts]
         conditions = conditions_of(facts, dataset)
         dated.append(Dated(one.name, path, time, source, scene, conditions=conditions))
+    if len(dated) < 2:
+        raise InputError(
+            f"a stack needs at least two images, not {len(dated)}",
+            field="orthos",
+            remedy=f"give a folder with orthos ({', '.join(RASTERS)}) or STAC items",
+        )
     return sorted(dated, key=lambda one: (one.time, one.name))
 
 
