@@ -108,7 +108,7 @@ def align(
     hidden = [ClassMask.parse(text) for text in listed_paths(masks, "masks")]
     request = Request(ortho, scene, match=match, output=output)
     ledger = Ledger(begun=states([*(path for _, path in request.files), *(mask.path for mask in hidden)]))
-    measured = measure_ortho(ortho, match, scene=scene, masks=hidden, band=band, output=output)
+    measured = measure_ortho(ortho, match, scene=scene, masks=hidden, band=band, output=output, whole=True)
     before = Verified.of(measured).relative().to_json(measured.pixel)
     chosen = _choose(measured, shift_only or not resample, bending)
     stem = Path(ortho).stem

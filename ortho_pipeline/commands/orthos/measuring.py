@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from ortho_pipeline.commands.control.matching import Matched, match_scene
+from ortho_pipeline.commands.control.matching import Matched, match_scene, open_reference_views
 from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
 from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE
@@ -143,6 +143,7 @@ def measure_ortho(
     band: int | None = None,
     output: OutputOptions = OutputOptions(),
     rounds: int = _AGAIN,
+    whole: bool = False,
 ) -> MeasuredOrtho:
     """Match an ortho with references.
 
@@ -150,11 +151,13 @@ def measure_ortho(
     ----------
     rounds : int
         Most matchings after the first, while many matches contradict it: places that bend or move get better ones.
+    whole : bool
+        Refuse an ortho of which a part is displaced farther than the matcher searches for a chip.
 
     Raises
     ------
     InputError
-        If the image is not an ortho, or matching fails.
+        If the image is not an ortho, matching fails, or a part is displaced.
     """
     opened = open_ortho(image, scene)
     options = replace(match, search=match.search or default_search(opened))
@@ -169,7 +172,10 @@ def measure_ortho(
             # Of several bands, one may be more like the reference than their mean.
             first = first or error
             continue
-        return replace(found, band=one)
+        found = replace(found, band=one)
+        if whole:
+            _refuse_displaced_part(found, options, masks, output)
+        return found
     assert first is not None
     raise first
 
@@ -227,6 +233,33 @@ def _matched(
             break
         found = better
     return found
+
+
+def _refuse_displaced_part(
+    found: MeasuredOrtho, options: MatchOptions, masks: Sequence[ClassMask], output: OutputOptions
+) -> None:
+    """Raise an error if a part of an ortho matches elsewhere: the figures of the rest are not those of the ortho."""
+    from ortho_pipeline.imaging.matching.sight import displaced_part
+
+    view, references = open_reference_views(found.scene, options, FlatSurface(0.0), found.opened)
+    bands = () if found.band is None else (found.band,)
+    intensity = _intensity(RasterSource(found.scene.path, **found.opened.access), bands, masks, found.opened)
+    view = replace(view, intensity=intensity, model=affine_of(found))
+    matches, reach = found.matched.matches, found.searched.search.distance / found.pixel
+    threads = output.threads or os.cpu_count() or 1
+    said = displaced_part(view, references, matches.image, matches.reason, matches.factor, reach, threads)
+    if said:
+        raise InputError(
+            f"a part of the ortho or of the reference is displaced: {said}",
+            file=found.scene.path,
+            field="match.reference",
+            remedy=Text(
+                "find out which of the two is wrong there, and make it again. If clouds or glaciers moved, leave them "
+                "out (",
+                Setting("masks"),
+                ")",
+            ),
+        )
 
 
 def _intensity(

@@ -145,7 +145,7 @@ class _Job:
         measured = None
         if self.match.reference:
             measured = measure_ortho(
-                opened, self.match, scene=self.scene, masks=self.masks, band=self.band, output=self.output
+                opened, self.match, scene=self.scene, masks=self.masks, band=self.band, output=self.output, whole=True
             )
         errors = self._point_errors(opened)
         filled = 1.0 if measured else float(filled_of(opened, self.scene, CELLS).mean())

@@ -18,7 +18,7 @@ from ortho_pipeline.models.base import Array
 #: Radius (chip px) of the searches after the first.
 NEXT = 4
 #: Significance level of agreement over chance.
-_ACCIDENT = 1e-6
+ACCIDENT = 1e-6
 
 #: A chip fits only one of two positions if its correlation there is at least the first number, and less than half of it
 #: at the other. If the second part of all chips do, and each position has the third part of them, at least the fourth
@@ -98,17 +98,31 @@ def divided_between(
     fits = (both.max(axis=1) > _FITS) & (both.min(axis=1) < both.max(axis=1) / 2)
     second = fits & (both[:, 1] > both[:, 0])
     first = fits & ~second
-    least = max(_FEWEST_PART, _PART * len(both))
-    if fits.sum() < _DIVIDED * len(both) or min(first.sum(), second.sum()) < least:
+    if fits.sum() < _DIVIDED * len(both) or min(first.sum(), second.sum()) < least_part(len(both)):
         return ""
-    apart = centres[second].mean(axis=0) - centres[first].mean(axis=0)
+    return said_of_parts(centres[first], centres[second], far)
+
+
+def least_part(chips: int) -> float:
+    """Return how many of some chips are a part of the scene."""
+    return max(_FEWEST_PART, _PART * chips)
+
+
+def said_of_parts(first: Array, second: Array, far: float) -> str:
+    """Return in words that chips with the centres `second` match `far` (m) from the position of the first."""
+    apart = second.mean(axis=0) - first.mean(axis=0)
     axis = int(np.abs(apart).argmax())
     side = (("left", "right"), ("upper", "lower"))[axis][int(apart[axis] > 0)]
     return (
-        f"{counted(int(first.sum()), 'chip matches', 'chips match')} at one position; "
-        f"{counted(int(second.sum()), 'chip matches', 'chips match')} {far:.0f} m from there, "
+        f"{counted(len(first), 'chip matches', 'chips match')} at one position; "
+        f"{counted(len(second), 'chip matches', 'chips match')} {far:.0f} m from there, "
         f"mostly in the {side} part of the scene"
     )
+
+
+def by_chance(agreeing: int, chips: int, tolerance: float, radius: float) -> float:
+    """Return the probability that so many chips, searched within a radius, agree by chance at one position."""
+    return float(bdtrc(agreeing - 1, chips, min(1.0, math.pi * tolerance**2 / (2 * radius + 1) ** 2)))
 
 
 def refuse_accident(
@@ -128,8 +142,7 @@ def refuse_accident(
     InputError
         If the probability is more than one in a million.
     """
-    share = min(1.0, math.pi * tolerance**2 / (2 * NEXT + 1) ** 2)
-    if float(bdtrc(agreeing - 1, chips, share)) * places > _ACCIDENT:
+    if by_chance(agreeing, chips, tolerance, NEXT) * places > ACCIDENT:
         raise InputError(
             f"cannot match the scene with {targets[0].called}: only {agreeing} of {counted(chips, 'chip')} agree "
             f"within {reach:.0f} px, which can be chance",

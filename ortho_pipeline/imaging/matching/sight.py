@@ -1,4 +1,6 @@
-"""Separate search of each chip along the line of sight, for heights whose errors differ from place to place.
+"""Separate search of each chip: along the line of sight, or for a part of the scene that is displaced.
+
+Height errors may differ from place to place.
 
 A wrong height moves a match in one direction of the image, along the line of sight (for two scenes, the epipolar line).
 If it moves by more than the size of a chip, no common shift is clear: chips agree only across the line of sight.
@@ -19,12 +21,13 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Text
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
+from ortho_pipeline.imaging.matching.agreement import ACCIDENT, by_chance, least_part, said_of_parts
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import FEWEST, MEASURED, SIDE, doubts, found_again, in_batches, seen
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
 from ortho_pipeline.imaging.matching.search import Level
-from ortho_pipeline.imaging.matching.targets import SceneView, Target
+from ortho_pipeline.imaging.matching.targets import SceneView, Target, metres_per_pixel
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.rays import meet_surface
@@ -39,6 +42,8 @@ _FIRST, _NEXT = 6, 4
 _ASKED = 100
 #: Least visible part of a chip in a coarse search.
 _GLIMPSED = 0.3
+#: Distance (chip px) within which chips of a displaced part agree.
+_TOGETHER = 2.5
 #: Distance (chip px) across the line of sight within which chips agree, and the significance level of their number.
 _ACROSS, _ACCIDENT = 1.5, 1e-6
 
@@ -124,6 +129,47 @@ class Chips:
 
     def _in_batches(self, work: Callable[[NDArray[np.int_]], None]) -> None:
         in_batches(work, np.flatnonzero(np.isfinite(self.offset).all(axis=1)), self.threads)
+
+
+def displaced_part(
+    view: SceneView,
+    targets: Sequence[Target],
+    centres: Array,
+    reason: NDArray[np.str_],
+    factor: int,
+    reach: float,
+    threads: int,
+) -> str:
+    """Return in words which part of a scene matches at another position than the rest; empty if none does.
+
+    Parameters
+    ----------
+    view : SceneView
+        With the corrected model.
+    centres : (n, 2)
+    reason : (n,) of str
+        Why the chip there was rejected, a key of `matcher.REASONS`; empty if it was kept.
+    factor : int
+        Pixels of the scene in a chip pixel.
+    reach : float
+        Largest displacement (px).
+    """
+    shown, lost = reason != "hidden", (reason != "hidden") & (reason != "")
+    if lost.sum() < least_part(int(shown.sum())):
+        return ""
+    chips = Chips(view, targets, centres[lost].astype(int), factor, reach, threads)
+    chips.search()
+    # Nearer ones are local changes, which the matcher has found.
+    far = np.flatnonzero(np.hypot(*chips.offset.T) > 2 * _NEXT * factor)
+    together = np.hypot(*(chips.offset[far, None] - chips.offset[far]).transpose(2, 0, 1)) <= _TOGETHER * factor
+    if not len(far) or together.sum(axis=1).max() < least_part(int(shown.sum())):
+        return ""
+    part = far[together[together.sum(axis=1).argmax()]]
+    radius = reach / factor
+    if by_chance(len(part), len(chips.offset), _TOGETHER, radius) * (2 * radius + 1) ** 2 > ACCIDENT:
+        return ""
+    metres = float(np.hypot(*np.median(chips.offset[part], axis=0))) * metres_per_pixel(view)
+    return said_of_parts(centres[reason == ""], centres[lost][part], metres)
 
 
 def along_sight(
