@@ -172,7 +172,7 @@ class Tiny:
             [
                 self.model.lon_off + 0.8 * self.model.lon_scale * random.uniform(-1, 1, count),
                 self.model.lat_off + 0.8 * self.model.lat_scale * random.uniform(-1, 1, count),
-                random.uniform(300, 700, count),
+                random.uniform(460, 540, count),
             ]
         )
         image = self.model.ground_to_image(ground) + self.bias + random.normal(0, noise, (count, 2))

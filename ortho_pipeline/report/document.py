@@ -258,8 +258,7 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
     largest = int(np.abs(difference).argmax())
     median, spread = median_and_spread(difference)
     doubts = datums_apart(difference, points.ground, points.crs, seen["lean_m_per_m"])
-    if not doubts and surface.coverage(points.ground[:, :2], points.crs) < 1.0:
-        doubts = _not_the_ground(difference, seen)
+    doubts = doubts or _not_the_ground(difference, seen)
     warning = str(doubts[0]) if doubts else None
     heights = PointHeights(
         median_m=median,
@@ -276,7 +275,8 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
 def _not_the_ground(difference: Array, seen: Mapping[str, Any]) -> list[Notice]:
     """Return a notice if the surface is typically far from the points ``(n,)`` m, and that moves the ortho by a pixel.
 
-    Flat ground and voids that are filled are such surfaces: the fit uses the heights of the points and does not see it.
+    Flat ground, filled voids and a DEM that is mirrored or of another place are such surfaces. The fit uses the heights
+    of the points and does not see it.
     """
     if len(difference) < 3:
         return []

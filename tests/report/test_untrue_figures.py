@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from osgeo import gdal
 
 from ortho_pipeline import open_dem, open_scene, read_points
 from ortho_pipeline.cli.program import cli
@@ -92,6 +93,20 @@ def test_flat_ground_that_is_not_the_ground_has_no_accuracy(tmp_path, height, un
     if unknown:
         # Phase correlation with the right ortho found an RMS of 56 m.
         assert 20.0 < codes["surface-not-ground"]["moved_m"] < 120.0
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_a_dem_that_is_upside_down_gives_no_accuracy(tmp_path, upside_down):
+    """It has a height everywhere, and is as often above the points as below them: the median showed nothing."""
+    scene, points = open_scene(SAMPLE / "scene.tif"), read_points(SAMPLE / "gcps.geojson")
+    copy = gdal.Translate(str(tmp_path / "dem.tif"), str(SAMPLE / "dem.tif"))
+    if upside_down:
+        copy.GetRasterBand(1).WriteArray(copy.ReadAsArray()[::-1])
+    copy = None
+    report = build_report(scene=scene, fit=scene.fit(points, "shift"), surface=open_dem(tmp_path / "dem.tif"))
+    moved = [one["moved_m"] for one in report.notices if one["code"] == "surface-not-ground"]
+    assert bool(moved) == (report.map_scale is None) == upside_down
+    assert min(moved, default=50.0) > 40.0
 
 
 def test_with_the_right_heights_all_of_them_show_it(outputs):

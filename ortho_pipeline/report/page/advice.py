@@ -26,7 +26,11 @@ _STOP: dict[str, str] = {
         Setting("surface.vertical"),
         ") and repeat the job.",
     ),
-    "surface-not-ground": Text("Use a DEM that covers the scene (", Setting("surface.dem"), ")."),
+    "surface-not-ground": Text(
+        "Use a DEM that covers the scene (",
+        Setting("surface.dem"),
+        "). Check its position, and the heights of the points.",
+    ),
     "model-elsewhere": "Check image, points, CRS, and the order of columns and rows.",
     "reference-made-of-scene": "Use another reference, one that was not made from this scene.",
     "unstable": "Add points, or use a simpler correction.",
