@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster.pixel_types import mask_of
+from ortho_pipeline.raster.pixel_types import valid_of
 from ortho_pipeline.raster.source import RasterSource, first_line
 
 #: Largest number of bands to average, and the least content of one, as part of that of the best band.
@@ -154,7 +154,7 @@ class Intensity:
             for band in bands:
                 way = gdal.GRIORA_NearestNeighbour if single and not band.GetOverviewCount() else gdal.GRIORA_Average
                 found += band.ReadAsArray(*window, **size, buf_type=gdal.GDT_Float32, resample_alg=way)
-                valid &= mask_of(band).ReadAsArray(*window, **size) != 0
+                valid &= valid_of(band, *window, **size)
         except RuntimeError as error:
             raise InputError(
                 f"the pixels cannot be read ({first_line(error, self.source.path)})",

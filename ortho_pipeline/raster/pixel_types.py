@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
@@ -75,23 +76,25 @@ def read_type(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
     return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)
 
 
-def alpha_of(band: Any) -> Any | None:
-    """Return the alpha band that is the mask of a band, where GDAL makes none of it; else None.
+def alpha_of(band: Any) -> int:
+    """Return the number of the alpha band that is the mask of a band, where GDAL makes none of it; else 0.
 
     GDAL does so in rasters of two and four bands alone.
     """
     dataset = band.GetDataset()
-    last = dataset.GetRasterBand(dataset.RasterCount)
-    alone = band.GetMaskFlags() == gdal.GMF_ALL_VALID and last.GetColorInterpretation() == gdal.GCI_AlphaBand
-    return last if alone else None
+    last = int(dataset.RasterCount)
+    is_alpha = dataset.GetRasterBand(last).GetColorInterpretation() == gdal.GCI_AlphaBand
+    return last if is_alpha and band.GetMaskFlags() == gdal.GMF_ALL_VALID else 0
 
 
 def mask_flags(band: Any) -> int:
     """Return GDAL's flags of the mask of a band."""
-    return int(band.GetMaskFlags()) if alpha_of(band) is None else gdal.GMF_PER_DATASET | gdal.GMF_ALPHA
+    return gdal.GMF_PER_DATASET | gdal.GMF_ALPHA if alpha_of(band) else int(band.GetMaskFlags())
 
 
-def mask_of(band: Any) -> Any:
-    """Return the mask of a band, as a band that is 0 where there is no value."""
-    alpha = alpha_of(band)
-    return band.GetMaskBand() if alpha is None else alpha
+def valid_of(band: Any, *window: int, **size: int) -> NDArray[np.bool_]:
+    """Return which pixels of a band have a value; arguments as of `ReadAsArray`."""
+    # Bands of a dataset that is released cannot be read.
+    dataset, alpha = band.GetDataset(), alpha_of(band)
+    mask = dataset.GetRasterBand(alpha) if alpha else band.GetMaskBand()
+    return np.asarray(mask.ReadAsArray(*window, **size) != 0)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.raster.pixel_types import mask_of
+from ortho_pipeline.raster.pixel_types import valid_of
 from ortho_pipeline.raster.source import Grid, open_pixels
 from ortho_pipeline.raster.verified_writing import png_bytes
 
@@ -33,7 +33,7 @@ def preview_png(
     size = _reduced(dataset.RasterXSize, dataset.RasterYSize, side)
     reading = {"buf_xsize": size[0], "buf_ysize": size[1]}
     bands = [dataset.GetRasterBand(k + 1) for k in range(3 if dataset.RasterCount >= 3 else 1)]
-    mask = mask_of(bands[0]).ReadAsArray(**reading) > 0
+    mask = valid_of(bands[0], **reading)
     # Without overviews an average has to look at every pixel, which takes as long as making them did.
     way = {"resample_alg": _AVERAGE} if bands[0].GetOverviewCount() else {}
     pixels = np.stack([band.ReadAsArray(**way, **reading) for band in bands])

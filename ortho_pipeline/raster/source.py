@@ -31,7 +31,7 @@ from ortho_pipeline.files.shell import converted
 from ortho_pipeline.raster.caching.block_cache import keep_blocks
 from ortho_pipeline.raster.opening.drivers import DRIVERS, refuse_dataset_within
 from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
-from ortho_pipeline.raster.pixel_types import check_types, mask_flags, mask_of, nodata_of, numpy_type, read_type
+from ortho_pipeline.raster.pixel_types import check_types, mask_flags, nodata_of, numpy_type, read_type, valid_of
 from ortho_pipeline.runtime.process_limits import require_memory
 from ortho_pipeline.stores.objects import stated_at
 
@@ -338,8 +338,8 @@ class _RasterFile:
                 if value is not None and not math.isnan(value):
                     np.not_equal(pixels[band], pixels.dtype.type(value), out=valid[band])
         if self._masked or self.validity in ("mask", "alpha"):
-            masks = [mask_of(self.dataset.GetRasterBand(number)) for number in self._mask_numbers]
-            mask = np.stack([self._io(mask.ReadAsArray, left, top, width, height) != 0 for mask in masks])
+            masked = [self.dataset.GetRasterBand(number) for number in self._mask_numbers]
+            mask = np.stack([self._io(valid_of, band, left, top, width, height) for band in masked])
             valid = np.broadcast_to(mask, pixels.shape).copy() if valid is None else valid & mask
         if pixels.dtype.kind == "f":
             numbers = ~np.isnan(pixels)

@@ -19,7 +19,7 @@ from shapely.geometry.base import BaseGeometry
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.files.shell import converted
 from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.raster.pixel_types import mask_of, numpy_type
+from ortho_pipeline.raster.pixel_types import numpy_type, valid_of
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import open_pixels
 
@@ -61,7 +61,7 @@ def sampled_mask(bands: Sequence[Any], columns: int, rows: int) -> NDArray[np.bo
     sample, valid = {"buf_xsize": columns, "buf_ysize": rows}, np.zeros((rows, columns), dtype=bool)
     for band in bands:
         if band.GetColorInterpretation() != _ALPHA and not valid.all():
-            own = mask_of(band).ReadAsArray(**sample) > 0
+            own = valid_of(band, **sample)
             if numpy_type(band.DataType).kind == "f":
                 # No mask has NaN if there is no nodata value.
                 own &= ~np.isnan(band.ReadAsArray(**sample))

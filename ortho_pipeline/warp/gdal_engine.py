@@ -207,7 +207,7 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         # Alpha that is no alpha of the ortho.
         first = source.dataset.GetRasterBand(1)
         alpha = mask_flags(first) & gdal.GMF_ALPHA and profile.validity != "alpha"
-        own = "mask,1" if (last := alpha_of(first)) is None else str(last.GetBand())
+        own = str(alpha_of(first) or "mask,1")
         view = transformer.source(source.dataset, tuple(source.band_numbers), mask=own if alpha else None)
         with written(_create(target, profile, grid)) as ortho:
             _describe(ortho, profile)

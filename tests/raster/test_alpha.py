@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from osgeo import gdal, osr
 
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.raster.pixel_types import valid_of
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.raster.valid_area import doubtful_alpha
 
@@ -54,17 +55,17 @@ def test_transparent_pixels_have_no_value_in_any_choice_of_bands(tmp_path, engin
 
 
 @pytest.mark.parametrize("engine", ["ortho", "gdal"])
-@pytest.mark.parametrize("bands", [(1, 2, 3, 4, 5), (1, 2, 3, 4), (2, 3, 4, 5), (4,)])
+@pytest.mark.parametrize("bands", [(1, 2, 3, 4, 5), (1, 2, 3, 4), (2, 3, 4, 5), (4,), (5,)])
 def test_alpha_counts_beside_any_number_of_bands(tmp_path, engine, bands):
-    """GDAL makes a mask of alpha in rasters of two and four bands alone."""
+    """GDAL makes a mask of alpha in rasters of two and four bands alone. It is its own, too."""
     pixels = write(tmp_path / "four.tif")
     pixels = np.insert(pixels, 3, pixels[0] + 1, axis=0)
     four = gdal.Open(str(tmp_path / "four.tif"))
     made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "image.tif"), SIDE, SIDE, 5)
     made.SetGeoTransform(four.GetGeoTransform())
     made.SetProjection(four.GetProjection())
-    made.WriteArray(pixels)
     made.GetRasterBand(5).SetColorInterpretation(gdal.GCI_AlphaBand)
+    made.WriteArray(pixels)
     made = None
     ortho = rectified(tmp_path, "-b", ",".join(map(str, bands)), "--engine", engine)
     valid = ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
@@ -108,3 +109,17 @@ def test_an_alpha_band_with_data_is_doubted(tmp_path, alpha, doubtful):
     assert ("doubtful-alpha" in [notice["code"] for notice in report["notices"]]) == doubtful
     made = gdal.Open(str(tmp_path / "image.tif"))
     assert [notice.fields for notice in doubtful_alpha(made)] == [{"band": 4}] * doubtful
+
+
+def test_the_mask_of_a_band_can_be_read_when_nothing_else_holds_its_dataset(tmp_path):
+    """GDAL's bands cannot be read after the object of their dataset is gone: that of `Band.GetDataset` is a new one."""
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "image.tif"), SIDE, SIDE, 5)
+    made.GetRasterBand(5).SetColorInterpretation(gdal.GCI_AlphaBand)
+    made.GetRasterBand(5).WriteArray(np.eye(SIDE))
+    made = None
+    opened = gdal.Open(str(tmp_path / "image.tif"))
+    np.testing.assert_array_equal(valid_of(opened.GetRasterBand(1)), np.eye(SIDE) > 0)
+    np.testing.assert_array_equal(
+        valid_of(opened.GetRasterBand(2), 3, 5, 4, 6, buf_xsize=2, buf_ysize=3),
+        opened.GetRasterBand(5).ReadAsArray(3, 5, 4, 6, buf_xsize=2, buf_ysize=3) > 0,
+    )
