@@ -21,7 +21,7 @@ from ortho_pipeline.batch.records import MAX_BYTES, FileState, RunRecord, key_of
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files import clear_up
-from ortho_pipeline.files.locations import VsiPath, located
+from ortho_pipeline.files.locations import Location, VsiPath, located
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.stores.delivery import address_of, delivered
 from ortho_pipeline.stores.objects import Objects
@@ -91,7 +91,8 @@ class FileSet:
 
     def _require_inputs(self) -> None:
         """Refuse to make it without an input: that would be recorded as a failure of the images."""
-        lost = next((state for state in self.inputs if not state.tag and not os.path.isfile(state.path)), None)
+        near = (state for state in self.inputs if not Location(state.path).is_far)
+        lost = next((state for state in near if not os.path.isfile(state.path)), None)
         if lost is not None:
             raise InputError(
                 "this worker does not have this input",
