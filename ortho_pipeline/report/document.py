@@ -245,20 +245,22 @@ def _surface(surface: Surface, coverage: float | None) -> FlatGround | Dem:
 def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> tuple[PointHeights | None, list[Notice]]:
     """Compare the heights of the points with the DEM's: a difference of datums shows here and nowhere else."""
     points = fit.points
+    stated = np.nan_to_num(points.sigma_ground[:, 2])
     if isinstance(surface, FlatSurface):
         difference = points.ground[:, 2] - surface.height
-        return None, _not_the_ground(difference[np.isfinite(difference)], seen)
+        known = np.isfinite(difference)
+        return None, _not_the_ground(difference[known], stated[known], seen)
     # Matches have the heights of the DEM.
     measured = points.groups < 0
     difference, ids = surface.above(points.ground[measured], points.crs), np.array(points.ids)[measured]
     known = np.isfinite(difference)
-    difference, ids = difference[known], ids[known]
+    difference, ids, stated = difference[known], ids[known], stated[measured][known]
     if not len(difference):
         return None, []
     largest = int(np.abs(difference).argmax())
     median, spread = median_and_spread(difference)
     doubts = datums_apart(difference, points.ground, points.crs, seen["lean_m_per_m"])
-    doubts = doubts or _not_the_ground(difference, seen)
+    doubts = doubts or _not_the_ground(difference, stated, seen)
     warning = str(doubts[0]) if doubts else None
     heights = PointHeights(
         median_m=median,
@@ -272,17 +274,17 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
     return heights, doubts
 
 
-def _not_the_ground(difference: Array, seen: Mapping[str, Any]) -> list[Notice]:
+def _not_the_ground(difference: Array, stated: Array, seen: Mapping[str, Any]) -> list[Notice]:
     """Return a notice if the surface is typically far from the points ``(n,)`` m, and that moves the ortho by a pixel.
 
     Flat ground, filled voids and a DEM that is mirrored or of another place are such surfaces. The fit uses the heights
-    of the points and does not see it.
+    of the points and does not see it. Points show nothing within two sigmas ``(n,)`` of the heights that they state.
     """
     if len(difference) < 3:
         return []
     typical, worst = 1.4826 * float(np.median(np.abs(difference))), float(np.abs(difference).max())
     moved = None if seen["lean_m_per_m"] is None else typical * seen["lean_m_per_m"]
-    if typical < _NOT_THE_GROUND:
+    if typical < max(_NOT_THE_GROUND, 2 * float(np.median(stated))):
         return []
     if moved is not None and moved < max(seen["ground_pixel_m"] or (0.0,)):
         return []

@@ -17,6 +17,7 @@ from ortho_pipeline.commands.rectification import no_rpc
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.report.document import build_report
 from ortho_pipeline.report.wording import NO_SCALE
+from ortho_pipeline.surface.flat import FlatSurface
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 PIPELINE = """
@@ -107,6 +108,20 @@ def test_a_dem_that_is_upside_down_gives_no_accuracy(tmp_path, upside_down):
     moved = [one["moved_m"] for one in report.notices if one["code"] == "surface-not-ground"]
     assert bool(moved) == (report.map_scale is None) == upside_down
     assert min(moved, default=50.0) > 40.0
+
+
+@pytest.mark.parametrize("sigma", [0.0, 30.0])
+def test_points_with_poor_heights_do_not_disprove_a_dem(tmp_path, sigma):
+    """Their heights are wrong by 30 m, as they state."""
+    scene, points = open_scene(SAMPLE / "scene.tif"), read_points(SAMPLE / "gcps.geojson")
+    ground, stated = points.ground.copy(), points.sigma_ground.copy()
+    ground[:, 2] += np.random.default_rng(1).normal(0.0, 30.0, len(ground))
+    stated[:, 2] = sigma
+    points = replace(points, ground=ground, sigma_ground=stated)
+    for surface in (open_dem(SAMPLE / "dem.tif"), FlatSurface(float(np.median(ground[:, 2])))):
+        report = build_report(scene=scene, fit=scene.fit(points, "shift"), surface=surface)
+        found = "surface-not-ground" in [one["code"] for one in report.notices]
+        assert found == (sigma == 0.0 or isinstance(surface, FlatSurface))
 
 
 def test_with_the_right_heights_all_of_them_show_it(outputs):
