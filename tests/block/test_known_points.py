@@ -190,7 +190,7 @@ def signs(
     found = doubtful_datums(fit, [*pseudo, Pseudo(0, 50.0, 1e-3, held=True)])  # type: ignore[arg-type]
     assert {one.code for one in found} <= {"datum-doubtful"}
     # A base station of the cameras can be wrong, too, and a few centimetres are no datum.
-    assert all("have a common error, such as that of another height datum" in str(one) for one in found)
+    assert all("can have a common error, such as that of another height datum" in str(one) for one in found)
     return [str(one).partition(":")[0] for one in found]
 
 

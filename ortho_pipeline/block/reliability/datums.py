@@ -53,7 +53,7 @@ def doubtful_datums(fit: BlockFit, pseudo: Sequence[Pseudo]) -> list[Notice]:
         if one.name == "focal_length" and abs(change) > _ALIKE * known_within:
             by = f"{change / one.prior.value:+.1%}, although its accuracy is {known_within / one.prior.value:.1%}"
             signs.append(f"the adjustment changes the focal length by {by}")
-    text = "points, cameras or DEM have a common error, such as that of another height datum or CRS"
+    text = "points, cameras or DEM can have a common error, such as that of another height datum or CRS"
     return [Notice("datum-doubtful", f"{sign}: {text}") for sign in signs]
 
 
