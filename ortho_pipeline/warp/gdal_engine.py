@@ -37,7 +37,7 @@ from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
-from ortho_pipeline.raster.pixel_types import alpha_of, gdal_type, mask_flags
+from ortho_pipeline.raster.pixel_types import alpha_of, gdal_type, mask_flags, numpy_type
 from ortho_pipeline.raster.source import Grid, first_line
 from ortho_pipeline.raster.verified_writing import gdal_errors, written
 from ortho_pipeline.runtime.signals import called_by_gdal
@@ -246,6 +246,14 @@ def _check(job: WarpJob) -> None:
     if any(band.GetMaskFlags() == 0 for band in job.source.bands):
         raise InputError(
             "GDAL's warper ignores masks of single bands",
+            file=job.source.path,
+            field="engine",
+            remedy="use the default engine",
+        )
+    alpha = alpha_of(job.source.dataset.GetRasterBand(1))
+    if alpha and numpy_type(job.source.dataset.GetRasterBand(alpha).DataType).kind == "f":
+        raise InputError(
+            "GDAL's warper rounds an alpha band of real numbers, so pixels below 0.5 would be empty",
             file=job.source.path,
             field="engine",
             remedy="use the default engine",

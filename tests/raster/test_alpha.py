@@ -123,3 +123,18 @@ def test_the_mask_of_a_band_can_be_read_when_nothing_else_holds_its_dataset(tmp_
         valid_of(opened.GetRasterBand(2), 3, 5, 4, 6, buf_xsize=2, buf_ysize=3),
         opened.GetRasterBand(5).ReadAsArray(3, 5, 4, 6, buf_xsize=2, buf_ysize=3) > 0,
     )
+
+
+@pytest.mark.parametrize("engine", ["ortho", "gdal"])
+def test_alpha_of_real_numbers_is_never_rounded(tmp_path, engine):
+    pixels = write(tmp_path / "four.tif") / np.float32([1, 1, 1, 400])[:, None, None]  # alpha of 0.32 and 0.64
+    four = gdal.Open(str(tmp_path / "four.tif"))
+    made = gdal.Translate(str(tmp_path / "image.tif"), four, outputType=gdal.GDT_Float32)
+    made.WriteArray(pixels)
+    made = None
+    if engine == "gdal":
+        with pytest.raises(AssertionError, match="rounds an alpha band of real numbers"):
+            rectified(tmp_path, "-b", "1,2,3", "--engine", engine)
+    else:
+        ortho = rectified(tmp_path, "-b", "1,2,3")
+        np.testing.assert_array_equal(ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0, pixels[3] > 0)
