@@ -152,7 +152,7 @@ def measure_ortho(
     rounds : int
         Most matchings after the first, while many matches contradict it: places that bend or move get better ones.
     whole : bool
-        Refuse an ortho of which a part is displaced by several chip pixels: such matches are left out.
+        Refuse an ortho of which a part is displaced farther than the matcher searches for a chip.
 
     Raises
     ------

@@ -159,8 +159,8 @@ def displaced_part(
         return ""
     chips = Chips(view, targets, centres[lost].astype(int), factor, reach, threads)
     chips.search()
-    # Nearer ones agree with the rest.
-    far = np.flatnonzero(np.hypot(*chips.offset.T) > _TOGETHER * factor)
+    # Nearer ones are local changes, which the matcher has found.
+    far = np.flatnonzero(np.hypot(*chips.offset.T) > 2 * _NEXT * factor)
     together = np.hypot(*(chips.offset[far, None] - chips.offset[far]).transpose(2, 0, 1)) <= _TOGETHER * factor
     if not len(far) or together.sum(axis=1).max() < least_part(int(shown.sum())):
         return ""
