@@ -226,11 +226,11 @@ class _Planner:
         for pattern in _listed(entry.images):
             matches = [image for image in self._matches(pattern, f"scenes[{number}].images") if image not in excluded]
             if not matches:
-                field = f"scenes[{number}].images"
-                what, remedy = f"no file matches {pattern!r}", "check the pattern, which is relative to "
-                remedy += str(self.places.address or self.places.base)
+                field, base = f"scenes[{number}].images", self.places.address or self.places.base
                 if set(self.places.matching(pattern, field)) - excluded:
                     what, remedy = f"only files in the output folder match {pattern!r}", "choose another output folder"
+                else:
+                    what, remedy = f"no file matches {pattern!r}", f"check the pattern, which is relative to {base}"
                 raise InputError(what, file=self.path, field=field, remedy=remedy)
             for image in matches:
                 place = self.places.inside(str(image), f"scenes[{number}].images") if isinstance(image, Path) else image

@@ -370,10 +370,11 @@ def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
 
 def _adjusted_again(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     """Return a notice of poses without an accuracy, such as those of a finished adjustment, that no control moved."""
-    if fit.points.control.any() or not fit.parameters:
+    if fit.points.control.any():
         return []
     posed = [label for label, one in starts.items() if isinstance(one.model, FrameCamera) and not one.priors]
-    again = [label for label in posed if label in dict(fit.parameters)]
+    adjusted = {label for label, _ in fit.parameters}
+    again = [label for label in posed if label in adjusted]
     text = f"the poses of {counted(len(again), 'image')} state no accuracy. They were adjusted again"
     return [Notice("adjusted-again", text, count=len(again), images=again[:10])] if again else []
 

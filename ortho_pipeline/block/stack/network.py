@@ -178,7 +178,7 @@ def _loops(incidence: sparse.csr_matrix, usable: NDArray[np.bool_]) -> int:
 
 def _least(edges: Edges, loops: int, usable: NDArray[np.bool_]) -> float:
     """Return the least constant variance of edges: with many loops it may be less than stated."""
-    return -loops / (loops + _STATED) * float(edges.alike[usable].min(initial=np.inf)) ** 2 if loops else 0.0
+    return -loops / (loops + _STATED) * float(edges.alike[usable].min()) ** 2 if loops else 0.0
 
 
 def _shifts(trends: Trends) -> Trends:

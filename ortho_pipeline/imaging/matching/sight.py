@@ -44,8 +44,8 @@ _ASKED = 100
 _GLIMPSED = 0.3
 #: Distance (chip px) within which chips of a displaced part agree.
 _TOGETHER = 2.5
-#: Distance (chip px) across the line of sight within which chips agree, and the significance level of their number.
-_ACROSS, _ACCIDENT = 1.5, 1e-6
+#: Distance (chip px) across the line of sight within which chips agree.
+_ACROSS = 1.5
 
 
 class Chips:
@@ -159,7 +159,7 @@ def displaced_part(
         return ""
     chips = Chips(view, targets, centres[lost].astype(int), factor, reach, threads)
     chips.search()
-    # Nearer ones are local changes, which the matcher has found.
+    # Wrong heights displace parts by some pixels, too; `verify` names that cause.
     far = np.flatnonzero(np.hypot(*chips.offset.T) > 2 * _NEXT * factor)
     together = np.hypot(*(chips.offset[far, None] - chips.offset[far]).transpose(2, 0, 1)) <= _TOGETHER * factor
     if not len(far) or together.sum(axis=1).max() < least_part(int(shown.sum())):
@@ -280,7 +280,7 @@ def _agreeing(offset: Array, along: Array, displaced: float, chips: Chips) -> ND
     most = near[int(near.sum(axis=1).argmax())]
     chance = min(1.0, float(np.prod([half / chips.reach for half in np.minimum(wide, chips.reach)])))
     count = len(offset)
-    accident = bdtrc(int(most.sum()) - 2, count - 1, chance) * count > _ACCIDENT
+    accident = bdtrc(int(most.sum()) - 2, count - 1, chance) * count > ACCIDENT
     return np.zeros(count, dtype=bool) if accident else most
 
 
