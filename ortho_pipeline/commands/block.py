@@ -372,9 +372,8 @@ def _adjusted_again(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     """Return a notice of poses without an accuracy, such as those of a finished adjustment, that no control moved."""
     if fit.points.control.any():
         return []
-    posed = [label for label, one in starts.items() if isinstance(one.model, FrameCamera) and not one.priors]
-    adjusted = {label for label, _ in fit.parameters}
-    again = [label for label in posed if label in adjusted]
+    adjusted = {label: starts[label] for label, _ in fit.parameters}
+    again = [label for label, one in adjusted.items() if isinstance(one.model, FrameCamera) and not one.priors]
     text = f"the poses of {counted(len(again), 'image')} state no accuracy. They were adjusted again"
     return [Notice("adjusted-again", text, count=len(again), images=again[:10])] if again else []
 
