@@ -225,10 +225,12 @@ def _of_most(measured: MeasuredOrtho) -> NDArray[np.bool_]:
 def _selected(measured: MeasuredOrtho, index: NDArray[np.bool_]) -> MeasuredOrtho:
     return dataclasses.replace(
         measured,
+        ids=tuple(np.array(measured.ids)[index].tolist()),
         image=measured.image[index],
         ground=measured.ground[index],
         displacement=measured.displacement[index],
         sigma=measured.sigma[index],
+        apart=measured.apart[index],
     )
 
 
@@ -285,7 +287,9 @@ def _after(
     again = dataclasses.replace(match, search=min(match.search or np.inf, 30.0 * measured.pixel), search_rotation=None)
     made = staged(path)
     try:
-        found = measure_ortho(made, again, scene=opened, masks=masks, band=band or measured.band, output=output)
+        found = measure_ortho(
+            made, again, scene=opened, masks=masks, band=band or measured.band, output=output, whole=True
+        )
     except OrthoError as error:
         if error.file == str(made):
             error.file = str(measured.scene.path)

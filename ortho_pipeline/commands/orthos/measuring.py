@@ -8,27 +8,31 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from ortho_pipeline.commands.control.matching import Matched, match_scene, open_reference_views
 from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
 from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching.chip_search import SIDE
 from ortho_pipeline.imaging.matching.least_squares import RIM
+from ortho_pipeline.imaging.matching.matcher import REASONS
+from ortho_pipeline.imaging.matching.sight import displaced_parts
 from ortho_pipeline.models import ImageCorrection, SensorModel, SmoothField
 from ortho_pipeline.models.base import Array, solve_2x2
 from ortho_pipeline.models.orthos.smooth_field import bending_of
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
+from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.flat import FlatSurface
@@ -65,6 +69,8 @@ class MeasuredOrtho:
         The last matching.
     searched : Matched
         The first one.
+    ids : tuple of str
+        Names of the matches.
     image : (n, 2)
         Places of matches in the ortho, px.
     ground : (n, 3)
@@ -73,6 +79,10 @@ class MeasuredOrtho:
         Metres to true east and north.
     sigma : (n,)
         Standard deviation (px) of each match alone.
+    apart : (n,) of bool
+        Which matches are in parts that are displaced from the rest.
+    reasons : dict of str to int
+        How many tried matches were rejected, by reason.
     metres : (2, 2)
         Metres to east and north of a pixel along columns and rows, in the middle.
     opened : SceneOptions
@@ -84,10 +94,13 @@ class MeasuredOrtho:
     scene: Scene
     matched: Matched
     searched: Matched
+    ids: tuple[str, ...]
     image: Array
     ground: Array
     displacement: Array
     sigma: Array
+    apart: NDArray[np.bool_]
+    reasons: Mapping[str, int]
     metres: Array
     opened: SceneOptions
     band: int | None = None
@@ -152,12 +165,12 @@ def measure_ortho(
     rounds : int
         Most matchings after the first, while many matches contradict it: places that bend or move get better ones.
     whole : bool
-        Refuse an ortho of which a part is displaced farther than the matcher searches for a chip.
+        Search rejected chips farther, and add those in parts that are displaced to the matches.
 
     Raises
     ------
     InputError
-        If the image is not an ortho, matching fails, or a part is displaced.
+        If the image is not an ortho, or matching fails.
     """
     opened = open_ortho(image, scene)
     options = replace(match, search=match.search or default_search(opened))
@@ -173,9 +186,7 @@ def measure_ortho(
             first = first or error
             continue
         found = replace(found, band=one)
-        if whole:
-            _refuse_displaced_part(found, options, masks, output)
-        return found
+        return _with_displaced_parts(found, options, masks, output) if whole else found
     assert first is not None
     raise first
 
@@ -235,31 +246,36 @@ def _matched(
     return found
 
 
-def _refuse_displaced_part(
+def _with_displaced_parts(
     found: MeasuredOrtho, options: MatchOptions, masks: Sequence[ClassMask], output: OutputOptions
-) -> None:
-    """Raise an error if a part of an ortho matches elsewhere: the figures of the rest are not those of the ortho."""
-    from ortho_pipeline.imaging.matching.sight import displaced_part
-
+) -> MeasuredOrtho:
+    """Return matches also of parts that match elsewhere: the displacement of the rest is not that of the ortho."""
     view, references = open_reference_views(found.scene, options, FlatSurface(0.0), found.opened)
     bands = () if found.band is None else (found.band,)
     intensity = _intensity(RasterSource(found.scene.path, **found.opened.access), bands, masks, found.opened)
-    view = replace(view, intensity=intensity, model=affine_of(found))
+    affine = affine_of(found)
+    view = replace(view, intensity=intensity, model=affine)
     matches, reach = found.matched.matches, found.searched.search.distance / found.pixel
     threads = output.threads or os.cpu_count() or 1
-    said = displaced_part(view, references, matches.image, matches.reason, matches.factor, reach, threads)
-    if said:
-        raise InputError(
-            f"a part of the ortho or of the reference is displaced: {said}",
-            file=found.scene.path,
-            field="match.reference",
-            remedy=Text(
-                "find out which of the two is wrong there, and make it again. If clouds or glaciers moved, leave them "
-                "out (",
-                Setting("masks"),
-                ")",
-            ),
-        )
+    index, offset, covariance = displaced_parts(
+        view, references, matches.image, matches.reason, matches.factor, reach, threads
+    )
+    image = matches.image[index]
+    ground = affine.image_to_ground(image + offset, 0.0)
+    plan, _ = metre_partials(found.scene.model, ground)
+    displacement = solve_2x2(plan, image - found.scene.model.ground_to_image(ground))
+    sigma = np.maximum(sigma_of_covariance(covariance), np.median(found.sigma))
+    reason = np.delete(matches.reason, index)
+    return replace(
+        found,
+        ids=found.ids + tuple(f"m{cell}" for cell in matches.cell[index]),
+        image=np.concatenate([found.image, image]),
+        ground=np.concatenate([found.ground, ground]),
+        displacement=np.concatenate([found.displacement, displacement]),
+        sigma=np.concatenate([found.sigma, sigma]),
+        apart=np.arange(len(found.image) + len(index)) >= len(found.image),
+        reasons={name: int((reason == name).sum()) for name in REASONS if (reason == name).any()},
+    )
 
 
 def _intensity(
@@ -291,10 +307,13 @@ def _measured(scene: Scene, matched: Matched, searched: Matched, opened: SceneOp
         scene,
         matched,
         searched,
+        points.ids,
         points.image,
         points.ground,
         solve_2x2(plan, off),
         points.sigma_image,
+        np.zeros(len(points), dtype=bool),
+        matched.record.reasons,
         metres,
         opened,
     )

@@ -39,6 +39,7 @@ from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.band_shifts import BandShift
+from ortho_pipeline.imaging.matching.agreement import said_of_parts
 from ortho_pipeline.models.base import Array, solve_2x2
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
@@ -290,7 +291,7 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
             "tried": matched.tried,
             "kept": len(measured.image),
             "local": int(field.local.sum()),
-            "reasons": measured.matched.record.reasons,
+            "reasons": dict(measured.reasons),
             "tested_share": verified.tested,
             "band": measured.band,
             "noise_px": json_value(field.noise / pixel),
@@ -388,6 +389,13 @@ def _notices(document: Mapping[str, Any], measured: MeasuredOrtho, reference_sig
     if reference_sigma is None and document["points"] is None:
         text = "this accuracy is relative to the reference; the error of the reference is not included"
         found.append(Notice("ortho-relative", text))
+    apart = measured.apart
+    if apart.any():
+        off = measured.displacement[apart] - np.median(measured.displacement[~apart], axis=0)
+        metres = float(np.median(np.hypot(*off.T)))
+        parts = said_of_parts(measured.image[~apart], measured.image[apart], metres)
+        text = f"a part of the ortho or of the reference is displaced: {parts}"
+        found.append(Notice("ortho-part-displaced", text, matches=int(apart.sum()), displaced_m=metres))
     local = document["matches"]["local"]
     if local > 0.02 * len(measured.image) and local > 2:
         text = f"{counted(local, 'match differs', 'matches differ')} from the neighbouring matches"
@@ -423,7 +431,7 @@ def displacements(measured: MeasuredOrtho) -> dict[str, Any]:
     lon_lat = ground_transform(measured.scene.model.crs, "EPSG:4979")(measured.ground)[:, :2]
     local = measured.field.local
     rows = zip(
-        measured.matched.matches.points.ids, lon_lat.tolist(), measured.image.tolist(), measured.displacement.tolist(),
+        measured.ids, lon_lat.tolist(), measured.image.tolist(), measured.displacement.tolist(),
         measured.sigma.tolist(), local.tolist(), strict=True,
     )  # fmt: skip
     features = [

@@ -23,7 +23,7 @@ ACCIDENT = 1e-6
 #: A chip fits only one of two positions if its correlation there is at least the first number, and less than half of it
 #: at the other. If the second part of all chips do, and each position has the third part of them, at least the fourth
 #: number, the target is inconsistent: parts of it are displaced.
-_FITS, _DIVIDED, _PART, _FEWEST_PART = 0.15, 0.75, 0.1, 4
+_FITS, _DIVIDED, _PART, FEWEST_PART = 0.15, 0.75, 0.1, 4
 
 
 def agreed(
@@ -105,7 +105,7 @@ def divided_between(
 
 def least_part(chips: int) -> float:
     """Return how many of some chips are a part of the scene."""
-    return max(_FEWEST_PART, _PART * chips)
+    return max(FEWEST_PART, _PART * chips)
 
 
 def said_of_parts(first: Array, second: Array, far: float) -> str:
@@ -116,13 +116,14 @@ def said_of_parts(first: Array, second: Array, far: float) -> str:
     return (
         f"{counted(len(first), 'chip matches', 'chips match')} at one position; "
         f"{counted(len(second), 'chip matches', 'chips match')} {far:.0f} m from there, "
-        f"mostly in the {side} part of the scene"
+        f"mostly in the {side} part of the image"
     )
 
 
-def by_chance(agreeing: int, chips: int, tolerance: float, radius: float) -> float:
+def by_chance(agreeing: int | NDArray[np.int_], chips: int, tolerance: float, radius: float) -> Array:
     """Return the probability that so many chips, searched within a radius, agree by chance at one position."""
-    return float(bdtrc(agreeing - 1, chips, min(1.0, math.pi * tolerance**2 / (2 * radius + 1) ** 2)))
+    chance = min(1.0, math.pi * tolerance**2 / (2 * radius + 1) ** 2)
+    return np.asarray(bdtrc(np.maximum(np.asarray(agreeing) - 1, 0), chips, chance))
 
 
 def refuse_accident(

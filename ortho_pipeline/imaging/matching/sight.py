@@ -21,13 +21,13 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Text
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
-from ortho_pipeline.imaging.matching.agreement import ACCIDENT, by_chance, least_part, said_of_parts
+from ortho_pipeline.imaging.matching.agreement import ACCIDENT, FEWEST_PART, by_chance
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import FEWEST, MEASURED, SIDE, doubts, found_again, in_batches, seen
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
 from ortho_pipeline.imaging.matching.search import Level
-from ortho_pipeline.imaging.matching.targets import SceneView, Target, metres_per_pixel
+from ortho_pipeline.imaging.matching.targets import SceneView, Target
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.rays import meet_surface
@@ -131,7 +131,7 @@ class Chips:
         in_batches(work, np.flatnonzero(np.isfinite(self.offset).all(axis=1)), self.threads)
 
 
-def displaced_part(
+def displaced_parts(
     view: SceneView,
     targets: Sequence[Target],
     centres: Array,
@@ -139,8 +139,8 @@ def displaced_part(
     factor: int,
     reach: float,
     threads: int,
-) -> str:
-    """Return in words which part of a scene matches at another position than the rest; empty if none does.
+) -> tuple[NDArray[np.int_], Array, Array]:
+    """Return which rejected chips of a scene are in parts that match at other positions than the rest, and where.
 
     Parameters
     ----------
@@ -153,23 +153,30 @@ def displaced_part(
         Pixels of the scene in a chip pixel.
     reach : float
         Largest displacement (px).
+
+    Returns
+    -------
+    index : (k,) of int
+        Chips of which more agree than do by chance.
+    offset : (k, 2)
+        Where the corrected model projects the same ground, minus the centre (px).
+    covariance : (k, 2, 2)
+        Of the offset.
     """
-    shown, lost = reason != "hidden", (reason != "hidden") & (reason != "")
-    if lost.sum() < least_part(int(shown.sum())):
-        return ""
+    lost = np.flatnonzero((reason != "hidden") & (reason != ""))
     chips = Chips(view, targets, centres[lost].astype(int), factor, reach, threads)
-    chips.search()
-    # Wrong heights displace parts by some pixels, too; `verify` names that cause.
-    far = np.flatnonzero(np.hypot(*chips.offset.T) > 2 * _NEXT * factor)
-    together = np.hypot(*(chips.offset[far, None] - chips.offset[far]).transpose(2, 0, 1)) <= _TOGETHER * factor
-    if not len(far) or together.sum(axis=1).max() < least_part(int(shown.sum())):
-        return ""
-    part = far[together[together.sum(axis=1).argmax()]]
-    radius = reach / factor
-    if by_chance(len(part), len(chips.offset), _TOGETHER, radius) * (2 * radius + 1) ** 2 > ACCIDENT:
-        return ""
-    metres = float(np.hypot(*np.median(chips.offset[part], axis=0))) * metres_per_pixel(view)
-    return said_of_parts(centres[reason == ""], centres[lost][part], metres)
+    if len(lost) >= FEWEST_PART:
+        chips.search()
+        # Nearer chips would have agreed with the rest.
+        chips.offset[~(np.hypot(*chips.offset.T) > _TOGETHER * factor)] = np.nan
+        apart = np.hypot(*(chips.offset[:, None] - chips.offset).transpose(2, 0, 1))
+        agreeing = (apart <= _TOGETHER * factor).sum(axis=1)
+        radius = reach / factor
+        chance = by_chance(agreeing, len(lost), _TOGETHER, radius) * (2 * radius + 1) ** 2
+        chips.offset[(agreeing < FEWEST_PART) | (chance > ACCIDENT)] = np.nan
+        chips.measure()
+    good = np.isfinite(chips.covariance).all(axis=(1, 2)) & np.isfinite(chips.offset).all(axis=1)
+    return lost[good], chips.offset[good], chips.covariance[good]
 
 
 def along_sight(
