@@ -1,6 +1,8 @@
 """RPC in and out, with GDAL's transformer and real products as the authorities."""
 
+import errno
 import math
+import os
 import shutil
 import zipfile
 from dataclasses import dataclass
@@ -314,6 +316,22 @@ def test_a_side_car_and_a_tag_agree_within_a_pixel(tmp_path, shift):
     else:
         with pytest.raises(InputError, match=r"differ by 1\.1 px"):
             rpc_of_dataset(gdal.Open(str(image)))
+
+
+def test_a_side_car_that_cannot_be_read_is_an_error_and_not_passed_over(tmp_path, monkeypatch):
+    dataset = gdal.Open(str(make_image(tmp_path / "a.tif", make_rpc())))
+    (tmp_path / "a_RPC.TXT").write_text("of another user")
+    opened = os.open
+
+    def refusing(path, *words):
+        if Path(path).name == "a_RPC.TXT":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return opened(path, *words)
+
+    monkeypatch.setattr(os, "open", refusing)
+    with pytest.raises(InputError, match=r"a_RPC\.TXT: scene\.rpc"):
+        rpc_of_dataset(dataset)
+    assert rpc_of_dataset(dataset, "tag")[1] == f"{tmp_path / 'a.tif'} (TIFF tag)"
 
 
 def test_choice_that_is_not_there_is_an_error(tmp_path):

@@ -781,7 +781,10 @@ def test_lagrange_follows_polynomials_of_degree_seven_and_short_tables() -> None
         assert np.allclose(rates, np.stack([slopes, 1 + 0 * wanted, 0 * wanted], axis=1), rtol=1e-7, atol=1e-5)
 
 
-@pytest.mark.parametrize(("away", "said"), [(1e10, "where no satellite can be"), (1e6, "no satellite is that fast")])
+@pytest.mark.parametrize(
+    ("away", "said"),
+    [(1e10, "where no satellite can be"), (-1e10, "where no satellite can be"), (1e6, "no satellite is that fast")],
+)
 def test_positions_of_no_satellite_are_refused(away: float, said: str) -> None:
     camera = scanner(12)
     times, positions, turns = tables_of(camera, np.linspace(-0.6, 1.6, 20) * camera.height)

@@ -52,6 +52,12 @@ def test_a_field_that_folds_is_refused():
         field(60.0)
 
 
+@pytest.mark.parametrize("shape", [(7, 9), (7, 9, 3), (1, 9, 2), (7, 1, 2)])
+def test_coefficients_of_another_shape_are_refused(shape):
+    with pytest.raises(InputError, match=r"coefficients \(rows, columns, 2\)"):
+        SmoothField(GRID, SIZE, np.zeros(shape))
+
+
 def test_the_field_is_its_splines_times_its_coefficients():
     model = field()
     image = np.random.default_rng(4).uniform((-40, -40), (640, 440), (60, 2))

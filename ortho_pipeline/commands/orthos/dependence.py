@@ -26,6 +26,8 @@ _PLACES, _WINDOW, _STEP_SIGMAS, _STEP_PIXELS = 41, 0.12, 6.0, 0.15
 _EXPLAINS = 0.5
 #: Half and whole pixels count as found within so many pixels.
 _EXACTLY = 0.06
+#: Causes of a displacement that changes linearly.
+_LINEAR = ("model", "rotation", "scale")
 
 
 @dataclass(frozen=True)
@@ -202,10 +204,19 @@ def causes_of(
     if heights is not None and heights.counts(measured.pixel):
         found.append(_of_heights(heights, max(whole - _square(rest.mean), 0.0)))
     found += _of_rest(rest, heights, steps)
+    if _square(_linear(rest)) > _square(_linear(verified)):
+        # A coarse DEM errs in single hills, not in the trend of the heights. Without that trend the rest has one.
+        found = [one for one in found if one.code not in _LINEAR]
     return [
         {"code": one.code, "text": one.text, "share": min(one.square / whole, 1.0) if whole > 0 else 0.0}
         for one in sorted(found, key=lambda one: -one.square)
     ]
+
+
+def _linear(verified: Verified) -> Array:
+    """Return the linear part ``(m, 2)`` of the displacement at the cells, metres."""
+    step = np.linalg.norm(verified.measured.metres, axis=0)
+    return np.asarray((verified.cells - verified.cells.mean(axis=0)) * step @ slopes_of(verified)[0].T)
 
 
 def _square(shifts: Array) -> float:
@@ -248,8 +259,7 @@ def _of_slopes(verified: Verified) -> list[Cause]:
     # In the directions of columns (east, in a north-up map) and rows (south).
     turn = measured.metres / np.linalg.norm(measured.metres, axis=0)
     matrix = slopes @ np.linalg.inv(turn)
-    cells = (verified.cells - verified.cells.mean(axis=0)) * np.linalg.norm(measured.metres, axis=0)
-    square = _square(cells @ slopes.T)
+    square = _square(_linear(verified))
     sigma = float(sigmas.max())
     reach = 0.35 * max(measured.size) * measured.pixel
     rotation = (matrix[0, 1] - matrix[1, 0]) / 2
