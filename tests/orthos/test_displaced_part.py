@@ -32,7 +32,7 @@ def written(folder: Path, moved: int) -> tuple[Path, Path]:
     return ortho, reference
 
 
-@pytest.mark.parametrize("moved", [0, 4, 15])
+@pytest.mark.parametrize("moved", [0, 1, 4, 15])
 def test_rejected_chips_that_agree_elsewhere_are_a_displaced_part(tmp_path, moved):
     ortho, reference = written(tmp_path, moved)
     view = SceneView(Intensity(RasterSource(ortho)), open_ortho(ortho, SceneOptions()).model, FlatSurface(0.0))

@@ -389,7 +389,7 @@ def _notices(document: Mapping[str, Any], measured: MeasuredOrtho, reference_sig
     if reference_sigma is None and document["points"] is None:
         text = "this accuracy is relative to the reference; the error of the reference is not included"
         found.append(Notice("ortho-relative", text))
-    apart = measured.apart
+    apart = measured.apart & ~measured.field.local
     if apart.any():
         off = measured.displacement[apart] - np.median(measured.displacement[~apart], axis=0)
         metres = float(np.median(np.hypot(*off.T)))

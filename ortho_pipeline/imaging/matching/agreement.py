@@ -120,9 +120,9 @@ def said_of_parts(first: Array, second: Array, far: float) -> str:
     )
 
 
-def by_chance(agreeing: int | NDArray[np.int_], chips: int, tolerance: float, radius: float) -> Array:
+def by_chance(agreeing: int | NDArray[np.int_], chips: int, tolerance: float | Array, radius: float | Array) -> Array:
     """Return the probability that so many chips, searched within a radius, agree by chance at one position."""
-    chance = min(1.0, math.pi * tolerance**2 / (2 * radius + 1) ** 2)
+    chance = np.minimum(1.0, math.pi * tolerance**2 / (2 * radius + 1) ** 2)
     return np.asarray(bdtrc(np.maximum(np.asarray(agreeing) - 1, 0), chips, chance))
 
 

@@ -42,7 +42,8 @@ _FIRST, _NEXT = 6, 4
 _ASKED = 100
 #: Least visible part of a chip in a coarse search.
 _GLIMPSED = 0.3
-#: Distance (chip px) within which chips of a displaced part agree.
+#: Least displacement (chip px) of a part, and the largest distance within which its chips agree.
+_LEAST = 0.5
 _TOGETHER = 2.5
 #: Distance (chip px) across the line of sight within which chips agree.
 _ACROSS = 1.5
@@ -167,14 +168,15 @@ def displaced_parts(
     chips = Chips(view, targets, centres[lost].astype(int), factor, reach, threads)
     if len(lost) >= FEWEST_PART:
         chips.search()
-        # Nearer chips would have agreed with the rest.
-        chips.offset[~(np.hypot(*chips.offset.T) > _TOGETHER * factor)] = np.nan
-        apart = np.hypot(*(chips.offset[:, None] - chips.offset).transpose(2, 0, 1))
-        agreeing = (apart <= _TOGETHER * factor).sum(axis=1)
-        radius = reach / factor
-        chance = by_chance(agreeing, len(lost), _TOGETHER, radius) * (2 * radius + 1) ** 2
-        chips.offset[(agreeing < FEWEST_PART) | (chance > ACCIDENT)] = np.nan
         chips.measure()
+        length = np.nan_to_num(np.hypot(*chips.offset.T) / factor)
+        apart = np.hypot(*(chips.offset[:, None] - chips.offset).transpose(2, 0, 1)) / factor
+        # Errors of matches are mostly small, so many of them agree on a small displacement.
+        agree, radius = np.minimum(_TOGETHER, length / 2), np.minimum(reach / factor, 2 * length)
+        agreeing = (apart <= agree[:, None]).sum(axis=1)
+        chance = by_chance(agreeing, len(lost), agree, radius) * (2 * reach / factor + 1) ** 2
+        unlike = (length < _LEAST) | (agreeing < FEWEST_PART) | (chance > ACCIDENT)
+        chips.offset[unlike] = np.nan
     good = np.isfinite(chips.covariance).all(axis=(1, 2)) & np.isfinite(chips.offset).all(axis=1)
     return lost[good], chips.offset[good], chips.covariance[good]
 
