@@ -25,7 +25,7 @@ from ortho_pipeline.models.base import Array, Constraints, SensorModel
 from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.metadata import mounting_of_angles, pushbroom_of_metadata
-from ortho_pipeline.models.pushbroom.rotations import angles_of, orbital_axes, rotations
+from ortho_pipeline.models.pushbroom.rotations import angles_of, exact_rotation, orbital_axes, rotations
 from ortho_pipeline.models.pushbroom.splines import Spline, SplineForm
 from ortho_pipeline.models.pushbroom.tables import (
     lagrange,
@@ -209,6 +209,12 @@ def test_rounded_rotations_are_made_rotations() -> None:
     assert np.abs(rounded.ground_to_image(rounded.image_to_ground(image, 300.0)) - image).max() < 1e-7
     again = model_from_dict(json.loads(json.dumps(rounded.to_dict())))
     assert again.to_dict() == rounded.to_dict()
+
+
+@pytest.mark.parametrize("scale", [1.0 - 1e-6, 1.0 + 1e-6])
+def test_matrices_that_are_a_little_too_short_or_long_are_made_rotations(scale: float) -> None:
+    made = exact_rotation(scale * exact(scanner()).mounting, "mounting")
+    assert np.abs(made.T @ made - np.eye(3)).max() < 1e-14
 
 
 def test_copies_in_other_processes_project_alike() -> None:
