@@ -802,6 +802,15 @@ def test_positions_of_no_satellite_are_refused(away: float, said: str) -> None:
         )  # fmt: skip
 
 
+@pytest.mark.parametrize(("what", "at"), [("times", 3), ("values", 3)])
+def test_a_spline_needs_times_and_values_that_are_numbers(what: str, at: int) -> None:
+    table = {"times": np.linspace(0.0, 1.0, 9), "values": np.ones((9, 3))}
+    assert np.allclose(Spline.fitted(**table, degree=2, breaks=[0.0, 1.0])(np.array([0.5])), 1.0)
+    table[what][at] = np.nan
+    with pytest.raises(InputError, match="no spline can follow"):
+        Spline.fitted(**table, degree=2, breaks=[0.0, 1.0])
+
+
 def test_a_derivative_of_a_spline_beyond_its_degree_is_zero() -> None:
     line = Spline(1, np.array([0.0, 1.0]), np.array([[0.0, 1.0, 2.0], [3.0, 5.0, 7.0]]))
     assert np.allclose(line(np.array([-1.0, 0.5, 2.0]), 1), [3.0, 4.0, 5.0])

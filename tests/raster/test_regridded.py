@@ -200,6 +200,11 @@ def test_bounds_in_another_crs_hold_the_whole_grid() -> None:
     assert warped_bounds(GRID, parse_crs("EPSG:4326")) == pytest.approx(wanted, abs=1e-7)
 
 
+def test_bounds_in_a_crs_of_no_place_are_infinite() -> None:
+    local = pyproj.CRS('LOCAL_CS["a building site",UNIT["metre",1]]')
+    assert warped_bounds(GRID, local) == (math.inf,) * 4
+
+
 def test_a_file_that_refers_to_another_folder_is_read_where_that_is_allowed(ortho: Path, tmp_path: Path) -> None:
     gdal.BuildVRT(str(tmp_path / "a.vrt"), [str(ortho)])
     with pytest.raises(InputError, match="outside"):
