@@ -402,6 +402,13 @@ def global_dem(folder: Path, **options: str) -> Surface:
     return open_dem(path, "ellipsoid", **options)
 
 
+def test_a_turned_global_dem_has_the_same_heights_at_its_new_seam(tmp_path: Path) -> None:
+    surface = global_dem(tmp_path)
+    # Turned around 63 degrees east, the seam is at 117 degrees west, between two samples.
+    where = np.array([[-117.0, 10.0], [-113.0, -33.3], [-121.0, 40.0]])
+    np.testing.assert_allclose(surface.around(63.0).heights(where), surface.heights(where), rtol=1e-12)
+
+
 def test_no_two_surfaces_share_what_they_keep(tmp_path: Path) -> None:
     surface = global_dem(tmp_path, fill="nearest")
     where = np.array([[-0.5, 42.0], [33.0, 10.0], [-91.0, -33.3]])  # the first next to a void
