@@ -20,6 +20,7 @@ from ortho_pipeline.block.reliability.blunders import (
     _geman_mcclure,
     _huber,
     _refuse_many,
+    _robust,
     _significant,
     _suspects,
     _trusted,
@@ -250,6 +251,22 @@ def test_wrong_ground_is_found_where_its_own_error_enlarges_the_sigma(flown: Blo
 
 
 # -- rounds ------------------------------------------------------------------------------------------------------------
+
+
+def test_robust_rounds_end_when_weights_change_no_more(prepared: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    rounds, once = [], blunders.once
+
+    def shrinking(size: np.ndarray) -> np.ndarray:
+        return np.full_like(size, (1.0, 0.9, 0.6, 0.601)[len(rounds)])
+
+    monkeypatch.setattr(blunders, "_huber", shrinking)
+    monkeypatch.setattr(blunders, "_geman_mcclure", np.ones_like)
+    monkeypatch.setattr(blunders, "once", lambda linear: rounds.append(1) or once(linear))
+    problem, state, selection = prepared
+    solved = attempt(problem, state, selection)
+    _robust(solved, selection, blunders.standardise(solved), STATED)
+    # Four rounds of the first function, whose last factors are within two per cent, and two of the second.
+    assert len(rounds) == 6
 
 
 def mask(*points: int) -> np.ndarray:
