@@ -283,8 +283,8 @@ def _after(
 ) -> dict[str, Any]:
     """Return the document of the aligned ortho, measured in its own pixels, before it has its name."""
     opened = dataclasses.replace(scene, roots=(Path(measured.scene.path).parent, *scene.roots))
-    # What is left is small.
-    again = dataclasses.replace(match, search=min(match.search or np.inf, 30.0 * measured.pixel), search_rotation=None)
+    # What is left is small, but not in parts that are displaced.
+    again = dataclasses.replace(match, search_rotation=None)
     made = staged(path)
     try:
         found = measure_ortho(
