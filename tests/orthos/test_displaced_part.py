@@ -69,7 +69,7 @@ def test_a_displaced_part_is_in_the_accuracy(tmp_path, moved):
     assert "mostly in the right part of the image" in notice["text"]
 
 
-@pytest.mark.parametrize(("moved", "first", "search"), [(45, FROM, 60.0)])
+@pytest.mark.parametrize(("moved", "first", "search"), [(10, SIDE - 70, 11.0), (45, FROM, 60.0)])
 def test_align_says_what_it_cannot_correct(tmp_path, moved, first, search):
     ortho, reference = written(tmp_path, moved, first)
     match = MatchOptions(reference=[str(reference)], search=search, points=80)

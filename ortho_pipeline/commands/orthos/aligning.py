@@ -176,8 +176,10 @@ def _refuse_unusable(ortho: Location, match: MatchOptions, bending: float, resam
 
 def _choose(measured: MeasuredOrtho, shift_only: bool, bending: float) -> Chosen:
     """Return a shift, or the correction that the matches justify."""
+    # A field bends too little to follow the edge of a displaced part, and would displace the ground around it.
+    measured = measured.selected(~measured.apart)
     most = _of_most(measured)
-    kept = _selected(measured, most)
+    kept = measured.selected(most)
     cells = tested_cells(kept)
     affine = affine_of(kept)
     left = kept.image - affine.ground_to_image(kept.ground)
@@ -220,18 +222,6 @@ def _of_most(measured: MeasuredOrtho) -> NDArray[np.bool_]:
     field = DisplacementField.of(measured.image, left, measured.sigma, measured.chip)
     # Where many are apart, the displacement as a whole bends: then only single matches are of no use.
     return ~field.local if apart.mean() > _MOST else ~(apart | field.local)
-
-
-def _selected(measured: MeasuredOrtho, index: NDArray[np.bool_]) -> MeasuredOrtho:
-    return dataclasses.replace(
-        measured,
-        ids=tuple(np.array(measured.ids)[index].tolist()),
-        image=measured.image[index],
-        ground=measured.ground[index],
-        displacement=measured.displacement[index],
-        sigma=measured.sigma[index],
-        apart=measured.apart[index],
-    )
 
 
 def _justified(kept: MeasuredOrtho, field: DisplacementField, cells: Array) -> tuple[str, str]:

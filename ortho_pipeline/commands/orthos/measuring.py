@@ -146,6 +146,18 @@ class MeasuredOrtho:
         """Displacement ``(n, 2)`` in px: measured minus the map grid."""
         return np.asarray(self.image - self.scene.model.ground_to_image(self.ground))
 
+    def selected(self, index: NDArray[np.bool_]) -> MeasuredOrtho:
+        """Return it with some of its matches ``(n,)``."""
+        return replace(
+            self,
+            ids=tuple(np.array(self.ids)[index].tolist()),
+            image=self.image[index],
+            ground=self.ground[index],
+            displacement=self.displacement[index],
+            sigma=self.sigma[index],
+            apart=self.apart[index],
+        )
+
 
 def measure_ortho(
     image: str | os.PathLike[str] | Scene,
