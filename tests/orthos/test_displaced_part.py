@@ -67,6 +67,8 @@ def test_a_displaced_part_is_in_the_accuracy(tmp_path, moved):
     notice = next(one for one in document["notices"] if one["code"] == "ortho-part-displaced")
     assert notice["displaced_m"] == pytest.approx(moved, abs=0.5)
     assert "mostly in the right part of the image" in notice["text"]
+    # A model that was not adjusted was named as well.
+    assert {cause["code"] for cause in document["causes"]} <= {"step"}
 
 
 @pytest.mark.parametrize(("moved", "first", "search"), [(10, SIDE - 70, 11.0), (45, FROM, 60.0)])

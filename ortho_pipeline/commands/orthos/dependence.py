@@ -26,8 +26,6 @@ _PLACES, _WINDOW, _STEP_SIGMAS, _STEP_PIXELS = 41, 0.12, 6.0, 0.15
 _EXPLAINS = 0.5
 #: Half and whole pixels count as found within so many pixels.
 _EXACTLY = 0.06
-#: Causes of a displacement that changes linearly.
-_LINEAR = ("model", "rotation", "scale")
 
 
 @dataclass(frozen=True)
@@ -190,33 +188,22 @@ class Cause:
 
 
 def causes_of(
-    verified: Verified, heights: HeightDependence | None, steps: Sequence[FieldStep], rest: Verified
+    verified: Verified, heights: HeightDependence | None, surface: Surface | None, steps: Sequence[FieldStep]
 ) -> list[dict[str, Any]]:
-    """Return the likely causes of the displacement as JSON values; that which explains most of it first.
-
-    Parameters
-    ----------
-    rest : Verified
-        What is left without that which heights explain; `verified` itself if they explain nothing.
-    """
+    """Return the likely causes of the displacement as JSON values; that which explains most of it first."""
     measured, whole = verified.measured, _square(verified.mean)
+    # The model of the ortho does not displace a part alone. If heights do, all matches have shown it.
+    rest = Verified.of(measured.selected(~measured.apart)) if measured.apart.any() else verified
     found = []
-    if heights is not None and heights.counts(measured.pixel):
-        found.append(_of_heights(heights, max(whole - _square(rest.mean), 0.0)))
+    if surface is not None and heights is not None and heights.counts(measured.pixel):
+        left = without_heights(verified, heights, surface)
+        found.append(_of_heights(heights, max(whole - _square(left.mean), 0.0)))
+        rest = without_heights(rest, heights, surface)
     found += _of_rest(rest, heights, steps)
-    if _square(_linear(rest)) > _square(_linear(verified)):
-        # A coarse DEM errs in single hills, not in the trend of the heights. Without that trend the rest has one.
-        found = [one for one in found if one.code not in _LINEAR]
     return [
         {"code": one.code, "text": one.text, "share": min(one.square / whole, 1.0) if whole > 0 else 0.0}
         for one in sorted(found, key=lambda one: -one.square)
     ]
-
-
-def _linear(verified: Verified) -> Array:
-    """Return the linear part ``(m, 2)`` of the displacement at the cells, metres."""
-    step = np.linalg.norm(verified.measured.metres, axis=0)
-    return np.asarray((verified.cells - verified.cells.mean(axis=0)) * step @ slopes_of(verified)[0].T)
 
 
 def _square(shifts: Array) -> float:
@@ -259,7 +246,8 @@ def _of_slopes(verified: Verified) -> list[Cause]:
     # In the directions of columns (east, in a north-up map) and rows (south).
     turn = measured.metres / np.linalg.norm(measured.metres, axis=0)
     matrix = slopes @ np.linalg.inv(turn)
-    square = _square(_linear(verified))
+    cells = (verified.cells - verified.cells.mean(axis=0)) * np.linalg.norm(measured.metres, axis=0)
+    square = _square(cells @ slopes.T)
     sigma = float(sigmas.max())
     reach = 0.35 * max(measured.size) * measured.pixel
     rotation = (matrix[0, 1] - matrix[1, 0]) / 2

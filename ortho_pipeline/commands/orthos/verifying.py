@@ -18,7 +18,6 @@ from ortho_pipeline.commands.orthos.dependence import (
     causes_of,
     height_dependence,
     steps_of,
-    without_heights,
 )
 from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.measuring import CELLS, MeasuredOrtho, measure_ortho, pixel_of
@@ -276,9 +275,6 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
     pixel, field = measured.pixel, verified.field
     relative = verified.relative()
     heights: HeightDependence | None = None if surface is None else height_dependence(measured, surface)
-    rest = verified
-    if surface is not None and heights is not None and heights.counts(pixel):
-        rest = without_heights(verified, heights, surface)
     steps: list[FieldStep] = steps_of(measured, field)
     matched = measured.searched.record
     bands = _bands(measured)
@@ -305,7 +301,7 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
         "rows": profile(verified, 1),
         "steps": [one.to_json() for one in steps],
         "bands": bands,
-        "causes": causes_of(verified, heights, steps, rest) + _band_causes(bands),
+        "causes": causes_of(verified, heights, surface, steps) + _band_causes(bands),
     }
 
 
