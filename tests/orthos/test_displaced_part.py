@@ -51,6 +51,27 @@ def test_rejected_chips_that_agree_elsewhere_are_a_displaced_part(tmp_path, move
         assert not len(index)
 
 
+def test_places_that_change_alike_all_over_are_no_part(tmp_path):
+    # Hedges and shadows of another season do, and 51 of 2,171 chips were a part that is displaced by 0.5 px.
+    ortho, reference = Pair(side=SIDE, seed=11).write(tmp_path)
+    opened = gdal.Open(str(ortho), gdal.GA_Update)
+    pixels = opened.ReadAsArray()
+    columns, rows = np.meshgrid(np.arange(24.0, SIDE - 20, 16), np.arange(24.0, SIDE - 20, 16))
+    centres = np.column_stack([columns.ravel(), rows.ravel()])
+    changed = (centres % 64 == 24).all(axis=1)
+    moved = np.roll(pixels, 4, axis=0)
+    for column, row in centres[changed].astype(int):
+        place = slice(row - 24, row + 24), slice(column - 24, column + 24)
+        pixels[place] = moved[place]
+    opened.GetRasterBand(1).WriteArray(pixels)
+    opened = None
+    view = SceneView(Intensity(RasterSource(ortho)), open_ortho(ortho, SceneOptions()).model, FlatSurface(0.0))
+    references = open_references([str(reference)])
+    index, _, _ = displaced_parts(view, references, centres, np.where(changed, "weak", ""), 1, 40.0, 1)
+    assert changed.sum() == 16
+    assert not len(index)
+
+
 @pytest.mark.parametrize("moved", [3, 12])
 def test_a_displaced_part_is_in_the_accuracy(tmp_path, moved):
     # Matches there were left out as contradicting or ambiguous, and CE90 was 0.004 m.

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from ortho_pipeline.errors import InputError
@@ -45,6 +46,8 @@ _GLIMPSED = 0.3
 #: Least displacement (chip px) of a part, and the largest distance within which its chips agree.
 _LEAST = 0.5
 _TOGETHER = 2.5
+#: Number of chips around a chip, itself included, of which most agree with it in the middle of a part.
+_AROUND = 9
 #: Distance (chip px) across the line of sight within which chips agree.
 _ACROSS = 1.5
 
@@ -175,10 +178,35 @@ def displaced_parts(
         agree, radius = np.minimum(_TOGETHER, length / 2), np.minimum(reach / factor, 2 * length)
         agreeing = (apart <= agree[:, None]).sum(axis=1)
         chance = by_chance(agreeing, len(lost), agree, radius) * (2 * reach / factor + 1) ** 2
-        unlike = (length < _LEAST) | (agreeing < FEWEST_PART) | (chance > ACCIDENT)
-        chips.offset[unlike] = np.nan
+        common = (length >= _LEAST) & (agreeing >= FEWEST_PART) & (chance <= ACCIDENT)
+        inside = _in_areas(centres[lost], apart <= agree[:, None], common, centres[reason == ""])
+        chips.offset[~(common & inside)] = np.nan
     good = np.isfinite(chips.covariance).all(axis=(1, 2)) & np.isfinite(chips.offset).all(axis=1)
     return lost[good], chips.offset[good], chips.covariance[good]
+
+
+def _in_areas(centres: Array, alike: NDArray[np.bool_], common: NDArray[np.bool_], kept: Array) -> NDArray[np.bool_]:
+    """Return which chips ``(n,)`` are in areas of chips that agree: edges may change alike all over a scene.
+
+    In the middle of an area, most of the chips around a chip agree with it. At its edge, one in the middle does.
+
+    Parameters
+    ----------
+    alike : (n, n) of bool
+        Which chips agree; none with one that is lost.
+    common : (n,) of bool
+        Which chips agree with more than do by chance.
+    kept : (k, 2)
+        Centres of other chips, which agree with none.
+    """
+    found = np.flatnonzero(alike.any(axis=0))
+    places = np.concatenate([centres[found], kept])
+    near = cKDTree(places).query(centres, np.arange(1, min(_AROUND, len(places)) + 1))[1]
+    # The last column is for all that were kept.
+    near = np.minimum(near, len(found))
+    around = np.take_along_axis(np.pad(alike[:, found], ((0, 0), (0, 1))), near, axis=1)
+    middle = common & (around.mean(axis=1) >= 0.5)
+    return np.asarray((around & np.append(middle[found], False)[near]).any(axis=1))
 
 
 def along_sight(
