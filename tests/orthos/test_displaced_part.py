@@ -92,6 +92,17 @@ def test_a_displaced_part_is_in_the_accuracy(tmp_path, moved):
     assert {cause["code"] for cause in document["causes"]} <= {"step"}
 
 
+def test_a_small_part_is_in_the_rmse_and_not_in_the_ce90(tmp_path):
+    # A smooth field rounded its edges: RMSE was 0.93 m (0.89 to 0.97), and CE90 0.8 m.
+    ortho, reference = Pair(side=400, seed=11, patch=(5.0, 0.0)).write(tmp_path)
+    found = verify(ortho, match=MatchOptions(reference=[str(reference)], points=300)).document["relative"]
+    true = 5.0 / 4
+    assert found["rmse_m"]["value"] == pytest.approx(true, rel=0.15)
+    assert found["rmse_m"]["low"] < true < found["rmse_m"]["high"]
+    assert found["bias_east_m"]["low"] < 5.0 / 16 < found["bias_east_m"]["high"]
+    assert found["ce90_m"]["value"] < 0.02
+
+
 @pytest.mark.parametrize(("moved", "first", "search"), [(10, SIDE - 70, 11.0), (45, FROM, 60.0)])
 def test_align_says_what_it_cannot_correct(tmp_path, moved, first, search):
     ortho, reference = written(tmp_path, moved, first)

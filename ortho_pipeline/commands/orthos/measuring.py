@@ -138,8 +138,16 @@ class MeasuredOrtho:
 
     @functools.cached_property
     def field(self) -> DisplacementField:
-        """The field of the displacement (m) over the image (px)."""
-        return DisplacementField.of(self.image, self.displacement, self.sigma, self.chip)
+        """The field of the displacement (m) over the image (px), without parts that are displaced."""
+        rest = ~self.apart
+        return DisplacementField.of(self.image[rest], self.displacement[rest], self.sigma[rest], self.chip)
+
+    @property
+    def local(self) -> NDArray[np.bool_]:
+        """Which matches ``(n,)`` differ from their neighbours and are in no displaced part."""
+        found = np.zeros(len(self.image), dtype=bool)
+        found[~self.apart] = self.field.local
+        return found
 
     @property
     def residuals(self) -> Array:

@@ -13,6 +13,7 @@ Source: ASPRS 2023, Positional Accuracy Standards for Digital Geospatial Data, e
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -122,7 +123,7 @@ class Verified:
     Parameters
     ----------
     field : DisplacementField
-        In metres, over the image (px).
+        In metres, over the image (px), without parts that are displaced.
     cells : (m, 2)
         Middles of the tested cells, px.
     draws : (k, m, 2)
@@ -143,6 +144,8 @@ class Verified:
         field = measured.field
         cells = tested_cells(measured)
         draws = field.draws(cells, seed)
+        if measured.apart.any():
+            draws = _with_parts(draws, measured, cells, seed)
         # Residuals cannot show an error that all matches share.
         alike = measured.pixel * measured.alike(field.noise / measured.pixel)
         common = np.random.default_rng([seed, 1]).normal(0.0, alike, (len(draws), 1, 2))
@@ -164,13 +167,30 @@ class Verified:
         return Accuracy.of_fields(self.draws + shifts)
 
 
+def _with_parts(draws: Array, measured: MeasuredOrtho, cells: Array, seed: int) -> Array:
+    """Return fields ``(k, m, 2)`` at cells with the displaced parts, which have edges that no smooth field follows.
+
+    An edge is anywhere between the matches on both sides.
+    """
+    part, rest = measured.apart, ~(measured.apart | measured.local)
+    inner, near = spatial.cKDTree(measured.image[part]).query(cells)
+    outer, _ = spatial.cKDTree(measured.image[rest]).query(cells)
+    edge = np.random.default_rng([seed, 3]).uniform(-_spacing(measured), _spacing(measured), (len(draws), 1))
+    moved = draws - draws.mean(axis=0) + measured.displacement[part][near]
+    return np.where((outer - inner > edge)[..., None], moved, draws)
+
+
+def _spacing(measured: MeasuredOrtho) -> float:
+    """Return the mean distance (px) between tried places."""
+    return math.sqrt(math.prod(measured.size) / max(len(measured.searched.matches.image), 1))
+
+
 def tested_cells(measured: MeasuredOrtho) -> Array:
     """Return the middles ``(m, 2)`` px of the cells of an image that have values, and matches near them."""
     size = np.array(measured.size, dtype=float)
     steps = (np.arange(CELLS) + 0.5) / CELLS
     cells = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * size
-    tried = max(len(measured.searched.matches.image), 1)
-    reach = _REACH * max(float(np.sqrt(size.prod() / tried)), float(size.max()) / CELLS)
+    reach = _REACH * max(_spacing(measured), float(size.max()) / CELLS)
     near, _ = spatial.cKDTree(measured.image).query(cells)
     return np.asarray(cells[(near <= reach) & measured.shown.ravel()])
 

@@ -286,7 +286,7 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
         "matches": {
             "tried": matched.tried,
             "kept": len(measured.image),
-            "local": int(field.local.sum()),
+            "local": int(measured.local.sum()),
             "reasons": dict(measured.reasons),
             "tested_share": verified.tested,
             "band": measured.band,
@@ -385,7 +385,7 @@ def _notices(document: Mapping[str, Any], measured: MeasuredOrtho, reference_sig
     if reference_sigma is None and document["points"] is None:
         text = "this accuracy is relative to the reference; the error of the reference is not included"
         found.append(Notice("ortho-relative", text))
-    apart = measured.apart & ~measured.field.local
+    apart = measured.apart
     if apart.any():
         off = measured.displacement[apart] - np.median(measured.displacement[~apart], axis=0)
         metres = float(np.median(np.hypot(*off.T)))
@@ -425,7 +425,7 @@ def _written(
 def displacements(measured: MeasuredOrtho) -> dict[str, Any]:
     """Return the matches of an ortho as GeoJSON, with the displacement of each."""
     lon_lat = ground_transform(measured.scene.model.crs, "EPSG:4979")(measured.ground)[:, :2]
-    local = measured.field.local
+    local = measured.local
     rows = zip(
         measured.ids, lon_lat.tolist(), measured.image.tolist(), measured.displacement.tolist(),
         measured.sigma.tolist(), local.tolist(), strict=True,
