@@ -92,9 +92,11 @@ def test_a_displaced_part_is_in_the_accuracy(tmp_path, moved):
     assert {cause["code"] for cause in document["causes"]} <= {"step"}
 
 
-def test_a_small_part_is_in_the_rmse_and_not_in_the_ce90(tmp_path):
+@pytest.mark.parametrize("side", [SIDE, 400])
+def test_a_small_part_is_in_the_rmse_and_not_in_the_ce90(tmp_path, side):
+    # With a side of 60 px it was smaller than a chip of the coarsest search, and was not found.
     # A smooth field rounded its edges: RMSE was 0.93 m (0.89 to 0.97), and CE90 0.8 m.
-    ortho, reference = Pair(side=400, seed=11, patch=(5.0, 0.0)).write(tmp_path)
+    ortho, reference = Pair(side=side, seed=11, patch=(5.0, 0.0)).write(tmp_path)
     found = verify(ortho, match=MatchOptions(reference=[str(reference)], points=300)).document["relative"]
     true = 5.0 / 4
     assert found["rmse_m"]["value"] == pytest.approx(true, rel=0.15)

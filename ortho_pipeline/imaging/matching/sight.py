@@ -86,10 +86,33 @@ class Chips:
 
     def search(self) -> None:
         """Find each chip separately to a chip px, coarse to fine."""
+        factor = self._coarsest()
+        self._search(factor, max(_NEXT, math.ceil(self.reach / factor)))
+
+    def search_small(self) -> None:
+        """Find each chip from every level, and keep the best position: coarse chips are larger than small parts."""
+        factor = self._coarsest()
+        best, score = np.full(self.offset.shape, np.nan), np.full(len(self.offset), -np.inf)
+        radius = max(_NEXT, math.ceil(self.reach / factor))
+        while True:
+            self.offset, self.score = np.zeros_like(best), np.zeros_like(score)
+            self.reason[:] = ""
+            self._search(factor, radius)
+            better = np.isfinite(self.offset).all(axis=1) & (self.score > score)
+            best[better], score[better] = self.offset[better], self.score[better]
+            if factor == self.factor:
+                break
+            factor = max(self.factor, factor // 2)
+            radius = min(math.ceil(self.reach / factor), SIDE // 2)
+        self.offset, self.score = best, score
+
+    def _coarsest(self) -> int:
         factor = self.factor
         while self.reach / factor > _FIRST and SIDE * factor * 4 <= min(self.view.size):
             factor *= 2
-        radius = max(_NEXT, math.ceil(self.reach / factor))
+        return factor
+
+    def _search(self, factor: int, radius: int) -> None:
         while True:
             self._in_batches(self._level(factor, radius, finest=factor == self.factor))
             if factor == self.factor:
@@ -170,7 +193,7 @@ def displaced_parts(
     lost = np.flatnonzero((reason != "hidden") & (reason != ""))
     chips = Chips(view, targets, centres[lost].astype(int), factor, reach, threads)
     if len(lost) >= FEWEST_PART:
-        chips.search()
+        chips.search_small()
         chips.measure()
         length = np.nan_to_num(np.hypot(*chips.offset.T) / factor)
         apart = np.hypot(*(chips.offset[:, None] - chips.offset).transpose(2, 0, 1)) / factor
