@@ -73,7 +73,7 @@ _LOOK: dict[str, str] = {
     "stack-step": "Check whether the processing of the orthos changed then. The stack corrects the step.",
     "stack-mostly-moving": "Check that the area has stable ground, or stack a larger area.",
     "ortho-part-displaced": "Find out which of the two is wrong there. If clouds or glaciers moved, leave them out "
-    "with --mask.",
+    "with a mask.",
     "ortho-tested-in-part": "Add references that show the rest, or do not use the ortho there.",
     "left-out": "Check the point in the image and at its source. Measure it again or delete it.",
     "more-left-out": "Inspect the points and the model: they do not belong together.",
