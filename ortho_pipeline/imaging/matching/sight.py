@@ -195,41 +195,43 @@ def displaced_parts(
     if len(lost) >= FEWEST_PART:
         chips.search_small()
         chips.measure()
-        length = np.nan_to_num(np.hypot(*chips.offset.T) / factor)
-        apart = np.hypot(*(chips.offset[:, None] - chips.offset).transpose(2, 0, 1)) / factor
+        found = np.flatnonzero(np.isfinite(chips.offset).all(axis=1))
+        offset = chips.offset[found] / factor
+        length = np.hypot(*offset.T)
         # Errors of matches are mostly small, so many of them agree on a small displacement.
         agree, radius = np.minimum(_TOGETHER, length / 2), np.minimum(reach / factor, 2 * length)
-        agreeing = (apart <= agree[:, None]).sum(axis=1)
+        agreeing = cKDTree(offset).query_ball_point(offset, agree, return_length=True) if len(found) else agree
         chance = by_chance(agreeing, len(lost), agree, radius) * (2 * reach / factor + 1) ** 2
         common = (length >= _LEAST) & (agreeing >= FEWEST_PART) & (chance <= ACCIDENT)
-        inside = _in_areas(centres[lost], apart <= agree[:, None], common, centres[reason == ""])
-        chips.offset[~(common & inside)] = np.nan
+        inside = _in_areas(centres[lost[found]], offset, agree, common, centres[reason == ""])
+        chips.offset[found[~(common & inside)]] = np.nan
     good = np.isfinite(chips.covariance).all(axis=(1, 2)) & np.isfinite(chips.offset).all(axis=1)
     return lost[good], chips.offset[good], chips.covariance[good]
 
 
-def _in_areas(centres: Array, alike: NDArray[np.bool_], common: NDArray[np.bool_], kept: Array) -> NDArray[np.bool_]:
+def _in_areas(centres: Array, offset: Array, agree: Array, common: NDArray[np.bool_], kept: Array) -> NDArray[np.bool_]:
     """Return which chips ``(n,)`` are in areas of chips that agree: edges may change alike all over a scene.
 
     In the middle of an area, most of the chips around a chip agree with it. At its edge, one in the middle does.
 
     Parameters
     ----------
-    alike : (n, n) of bool
-        Which chips agree; none with one that is lost.
+    offset : (n, 2)
+    agree : (n,)
+        Distance of offsets within which others agree with each.
     common : (n,) of bool
         Which chips agree with more than do by chance.
     kept : (k, 2)
         Centres of other chips, which agree with none.
     """
-    found = np.flatnonzero(alike.any(axis=0))
-    places = np.concatenate([centres[found], kept])
+    places = np.concatenate([centres, kept])
     near = cKDTree(places).query(centres, np.arange(1, min(_AROUND, len(places)) + 1))[1]
-    # The last column is for all that were kept.
-    near = np.minimum(near, len(found))
-    around = np.take_along_axis(np.pad(alike[:, found], ((0, 0), (0, 1))), near, axis=1)
+    # The last one is for all that were kept.
+    near = np.minimum(near, len(centres))
+    apart = np.concatenate([offset, [(np.nan, np.nan)]])[near] - offset[:, None]
+    around = np.hypot(*apart.transpose(2, 0, 1)) <= agree[:, None]
     middle = common & (around.mean(axis=1) >= 0.5)
-    return np.asarray((around & np.append(middle[found], False)[near]).any(axis=1))
+    return np.asarray((around & np.append(middle, False)[near]).any(axis=1))
 
 
 def along_sight(
