@@ -83,12 +83,14 @@ def with_reference_height(model: SensorModel, ground: Array) -> Array:
     return ground
 
 
+def shifts_of(model: SensorModel, ground: Array, residuals: Array) -> Array:
+    """Return residuals ``(N, 2)`` px at ground points as shifts on the ground, metres true east and north."""
+    return solve_2x2(metre_partials(model, ground)[0], residuals)
+
+
 def in_metres(fit: Fit, residuals: Array) -> Array:
     """Return residuals ``(N, 2)`` px as shifts of the ortho on the ground, metres true east and north."""
-    if not len(residuals):
-        return np.zeros((0, 2))
-    plan, _ = metre_partials(fit.model, fit.points.ground)
-    return solve_2x2(plan, residuals)
+    return shifts_of(fit.model, fit.points.ground, residuals) if len(residuals) else np.zeros((0, 2))
 
 
 def rmse_metres(fit: Fit) -> RmsesOnGround:

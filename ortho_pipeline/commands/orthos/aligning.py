@@ -177,7 +177,7 @@ def _refuse_unusable(ortho: Location, match: MatchOptions, bending: float, resam
 def _choose(measured: MeasuredOrtho, shift_only: bool, bending: float) -> Chosen:
     """Return a shift, or the correction that the matches justify."""
     # A field bends too little to follow the edge of a displaced part, and would displace the ground around it.
-    measured = measured.selected(~measured.apart)
+    measured = measured.rest
     most = _of_most(measured)
     kept = measured.selected(most)
     cells = tested_cells(kept)

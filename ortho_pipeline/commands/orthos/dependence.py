@@ -193,7 +193,7 @@ def causes_of(
     """Return the likely causes of the displacement as JSON values; that which explains most of it first."""
     measured, whole = verified.measured, _square(verified.mean)
     # The model of the ortho does not displace a part alone. If heights do, all matches have shown it.
-    rest = Verified.of(measured.selected(~measured.apart)) if measured.apart.any() else verified
+    rest = Verified.of(measured.rest) if measured.apart.any() else verified
     found = []
     if surface is not None and heights is not None and heights.counts(measured.pixel):
         left = without_heights(verified, heights, surface)

@@ -20,7 +20,7 @@ from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
-from ortho_pipeline.estimation.ground_residuals import metre_partials
+from ortho_pipeline.estimation.ground_residuals import metre_partials, shifts_of
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
 from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE
 from ortho_pipeline.hookspecs import Scene
@@ -29,7 +29,7 @@ from ortho_pipeline.imaging.matching.least_squares import RIM
 from ortho_pipeline.imaging.matching.matcher import REASONS
 from ortho_pipeline.imaging.matching.sight import displaced_parts
 from ortho_pipeline.models import ImageCorrection, SensorModel, SmoothField
-from ortho_pipeline.models.base import Array, solve_2x2
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.orthos.smooth_field import bending_of
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.points.image_errors import sigma_of_covariance
@@ -137,10 +137,16 @@ class MeasuredOrtho:
         return np.asarray(self.filled >= min(0.5, self.filled.max()))
 
     @functools.cached_property
+    def rest(self) -> MeasuredOrtho:
+        """The same without parts that are displaced."""
+        return self.selected(~self.apart)
+
+    @functools.cached_property
     def field(self) -> DisplacementField:
         """The field of the displacement (m) over the image (px), without parts that are displaced."""
-        rest = ~self.apart
-        return DisplacementField.of(self.image[rest], self.displacement[rest], self.sigma[rest], self.chip)
+        if self.apart.any():
+            return self.rest.field
+        return DisplacementField.of(self.image, self.displacement, self.sigma, self.chip)
 
     @property
     def local(self) -> NDArray[np.bool_]:
@@ -282,8 +288,7 @@ def _with_displaced_parts(
     )
     image = matches.image[index]
     ground = affine.image_to_ground(image + offset, 0.0)
-    plan, _ = metre_partials(found.scene.model, ground)
-    displacement = solve_2x2(plan, image - found.scene.model.ground_to_image(ground))
+    displacement = _displacement(found.scene.model, image, ground)
     sigma = np.maximum(sigma_of_covariance(covariance), np.median(found.sigma))
     reason = np.delete(matches.reason, index)
     return replace(
@@ -319,8 +324,6 @@ def _intensity(
 
 def _measured(scene: Scene, matched: Matched, searched: Matched, opened: SceneOptions) -> MeasuredOrtho:
     points = matched.matches.points
-    plan, _ = metre_partials(scene.model, points.ground)
-    off = points.image - scene.model.ground_to_image(points.ground)
     middle = scene.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), 0.0)
     metres = np.linalg.inv(metre_partials(scene.model, middle)[0][0])
     return MeasuredOrtho(
@@ -330,13 +333,18 @@ def _measured(scene: Scene, matched: Matched, searched: Matched, opened: SceneOp
         points.ids,
         points.image,
         points.ground,
-        solve_2x2(plan, off),
+        _displacement(scene.model, points.image, points.ground),
         points.sigma_image,
         np.zeros(len(points), dtype=bool),
         matched.record.reasons,
         metres,
         opened,
     )
+
+
+def _displacement(model: SensorModel, image: Array, ground: Array) -> Array:
+    """Return the displacement ``(n, 2)`` in metres of ground that an ortho shows at places ``(n, 2)`` px."""
+    return shifts_of(model, ground, image - model.ground_to_image(ground))
 
 
 def following(measured: MeasuredOrtho) -> SensorModel | None:

@@ -31,7 +31,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import class_size, size_m
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.estimation.ground_residuals import metre_partials, with_reference_height
+from ortho_pipeline.estimation.ground_residuals import shifts_of, with_reference_height
 from ortho_pipeline.files import Checksums, sha256, together, write_json
 from ortho_pipeline.files.folders import listed_paths
 from ortho_pipeline.files.json.values import json_value
@@ -39,7 +39,7 @@ from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.band_shifts import BandShift
 from ortho_pipeline.imaging.matching.agreement import said_of_parts
-from ortho_pipeline.models.base import Array, solve_2x2
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.report.document import report_of_ortho
@@ -170,9 +170,8 @@ class _Job:
         _refuse_points_of_scene(points, opened)
         ground = with_reference_height(opened.model, points.ground)
         ground = ground_transform(points.crs, opened.model.crs)(ground)
-        plan, _ = metre_partials(opened.model, ground)
         off = points.image - opened.model.ground_to_image(ground)
-        errors = solve_2x2(plan, off)
+        errors = shifts_of(opened.model, ground, off)
         good = np.isfinite(errors).all(axis=1)
         typical = float(np.median(np.hypot(*off[good].T))) if good.any() else 0.0
         if typical > math.hypot(opened.width, opened.height):
