@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 import pyproj
+from numpy.typing import NDArray
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.geodesy.crs import ground_transform
@@ -24,6 +25,8 @@ class HasGround(Protocol):
     def ground(self) -> Array: ...
     @property
     def crs(self) -> pyproj.CRS: ...
+    @property
+    def check(self) -> NDArray[np.bool_]: ...
 
 
 def one_mark(points: HasGround) -> list[tuple[str, str]]:
@@ -51,14 +54,22 @@ def one_mark(points: HasGround) -> list[tuple[str, str]]:
     return [(points.ids[first], points.ids[second]) for first, second in sorted(pairs)]
 
 
-def marks_warning(control: HasGround) -> list[Notice]:
-    """Return a warning if control points are one mark: the second one adds no information."""
-    pairs = one_mark(control)
-    if not pairs:
-        return []
-    shown = ", ".join(f"{first} and {second}" for first, second in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
-    text = (
-        f"control points are within a centimetre of each other ({shown}). A mark that was measured twice counts as "
-        "two points, so redundancy and sigmas look too good: keep one point of each pair"
-    )
-    return [Notice("one-mark-twice", text, pairs=[list(pair) for pair in pairs])]
+def marks_warning(points: HasGround) -> list[Notice]:
+    """Return warnings if control or check points are one mark: the second one neither adds nor tests anything."""
+    pairs = one_mark(points)
+    checks = {name for name, check in zip(points.ids, points.check, strict=True) if check}
+    tested = [pair for pair in pairs if checks.intersection(pair)]
+    added = [pair for pair in pairs if pair not in tested]
+    found = []
+    for near, who, why in (
+        (added, "control points", "counts as two points, so redundancy and sigmas look too good"),
+        (tested, "check points and others", "tests nothing, so the accuracy looks too good"),
+    ):
+        if near:
+            shown = ", ".join(f"{first} and {second}" for first, second in near[:5]) + (" ..." if near[5:] else "")
+            text = (
+                f"{who} are within a centimetre of each other ({shown}). A mark that was measured twice {why}: keep "
+                "one point of each pair"
+            )
+            found.append(Notice("one-mark-twice", text, pairs=[list(pair) for pair in near]))
+    return found

@@ -100,7 +100,7 @@ def test_a_step_needs_two_lines_of_matches_on_each_side(lines, jump):
     noise = np.random.default_rng(3).normal(0.0, 0.005, image.shape)
     displacement = noise + (5.3, -3.1) + jump * (image[:, 1:] > 200)
     measured = types.SimpleNamespace(image=image, displacement=displacement, pixel=2.0)
-    found = steps_of(measured, None)
+    found = steps_of(measured)
     assert len(found) == (jump > 0)
     for step in found:
         assert (step.axis, round(step.east, 1), round(step.north, 1)) == ("row", jump, jump)

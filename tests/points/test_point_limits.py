@@ -39,6 +39,17 @@ def test_a_mark_is_one_within_a_centimetre(apart_mm: float, same: bool, axis: in
     assert bool(marks_warning(points)) is same
 
 
+def test_a_check_point_that_is_a_control_point_tests_nothing() -> None:
+    ground = np.array([[500_000.0, 4e6, 100.0]] * 2 + [[600_000.0, 4e6, 100.0]] * 2)
+    ground[1::2, 2] += 0.005
+    points = Points.of(np.eye(4, 2), ground, "EPSG:32636", roles=["control", "check", "control", "control"])
+    added, tested = marks_warning(points)
+    assert (added.code, added.fields["pairs"]) == ("one-mark-twice", [["3", "4"]])
+    assert (tested.code, tested.fields["pairs"]) == ("one-mark-twice", [["1", "2"]])
+    assert "tests nothing" in str(tested)
+    assert "redundancy" in str(added)
+
+
 def test_a_row_of_a_link_table_is_below_the_axis(tmp_path: Path) -> None:
     path = tmp_path / "links.txt"
     path.write_text("link table\na 5 1 24.5 -33.5\n6 -7 24.6 -33.6\n")

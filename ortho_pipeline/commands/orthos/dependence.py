@@ -129,7 +129,7 @@ def without_heights(verified: Verified, heights: HeightDependence, surface: Surf
     return replace(verified, cells=verified.cells[good], draws=draws)
 
 
-def steps_of(measured: MeasuredOrtho, field: DisplacementField) -> list[FieldStep]:
+def steps_of(measured: MeasuredOrtho) -> list[FieldStep]:
     """Return the largest steps along columns and rows, if there are any."""
     found = []
     for axis, name in ((0, "column"), (1, "row")):

@@ -274,7 +274,7 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
     pixel, field = measured.pixel, verified.field
     relative = verified.relative()
     heights: HeightDependence | None = None if surface is None else height_dependence(measured, surface)
-    steps: list[FieldStep] = steps_of(measured, field)
+    steps: list[FieldStep] = steps_of(measured)
     matched = measured.searched.record
     bands = _bands(measured)
     cells = [
