@@ -137,7 +137,7 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     output = OutputOptions(resampling="cubic", threads=1, format="GTiff")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        paths = rasters.write(folder / "in")
+        paths = rasters.write(folder / "in", given.workers)
         begin, wall = _cpu(), time.monotonic()
         with_workers: Any = {"executor": "processes", "workers": given.workers} if given.workers > 1 else {}
         match, spoiled = MatchOptions(search=60.0), Spoiled(seed, given.wrong_edges)

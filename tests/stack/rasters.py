@@ -5,6 +5,7 @@ Nothing here knows of the matcher, of the adjustment or of the warp: `tests/matc
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from datetime import date, timedelta
 from pathlib import Path
@@ -90,10 +91,13 @@ class Rasters:
         turn = np.random.default_rng([self.seed, 4]).uniform(0, 2 * np.pi)
         return self.rate * np.array([np.cos(turn), np.sin(turn)])
 
-    def write(self, folder: Path) -> list[Path]:
+    def write(self, folder: Path, workers: int = 1) -> list[Path]:
         """Write the rasters, with their dates as metadata."""
         folder.mkdir(parents=True, exist_ok=True)
-        return [self._write(folder, number) for number in range(self.dates)]
+        if workers == 1:
+            return [self._write(folder, number) for number in range(self.dates)]
+        with ProcessPoolExecutor(workers) as pool:
+            return list(pool.map(self._write, [folder] * self.dates, range(self.dates)))
 
     def _write(self, folder: Path, number: int) -> Path:
         random = np.random.default_rng([self.seed, 5, number])
