@@ -14,7 +14,7 @@ import numpy as np
 from landscape import CELL, SIZE, Land, land, sample
 from numpy.typing import NDArray
 from osgeo import gdal, osr
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import fourier_gaussian, gaussian_filter
 
 Array = NDArray[np.float64]
 UTM, CORNER, BEGIN = 32735, (512_000.0, 7_123_000.0), date(2020, 1, 10)
@@ -131,7 +131,9 @@ class Rasters:
 
     def _clouded(self, values: Array, random: np.random.Generator) -> Array:
         share = random.uniform(0, self.clouds)
-        low = gaussian_filter(random.normal(size=values.shape), self.side / 12, mode="wrap")
+        # As a wide filter in space, in a tenth of the time.
+        waves = fourier_gaussian(np.fft.rfft2(random.normal(size=values.shape)), self.side / 12, n=values.shape[1])
+        low = np.fft.irfft2(waves, values.shape)
         if share < 0.01:
             return values
         rank = low.ravel().argsort().argsort().reshape(low.shape) / low.size
