@@ -58,7 +58,7 @@ def fit(
     return FitResult(
         adjusted.scene,
         adjusted.fit,
-        adjusted.warnings(resolved.surface),
+        (*adjusted.warnings(resolved.surface), *report.datums_of(adjusted.fit, resolved.surface)),
         adjusted.removed,
         points.near,
         adjusted.matched,

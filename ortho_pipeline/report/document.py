@@ -35,7 +35,7 @@ from ortho_pipeline.geodesy.ellipsoid import longitudes_near
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.points.control_hull import control_hull
-from ortho_pipeline.points.heights.datums import datums_apart, median_and_spread
+from ortho_pipeline.points.heights.datums import FROM_DEM, datums_apart, median_and_spread
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
@@ -63,6 +63,7 @@ from ortho_pipeline.surface.flat import FlatSurface
 if TYPE_CHECKING:
     from ortho_pipeline.exchange.rpc_fit import RpcExport
     from ortho_pipeline.hookspecs import Scene
+    from ortho_pipeline.points import Points
     from ortho_pipeline.raster.source import Grid
     from ortho_pipeline.surface.base import Surface
     from ortho_pipeline.warp.job import WarpRecord
@@ -245,22 +246,18 @@ def _surface(surface: Surface, coverage: float | None) -> FlatGround | Dem:
 def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> tuple[PointHeights | None, list[Notice]]:
     """Compare the heights of the points with the DEM's: a difference of datums shows here and nowhere else."""
     points = fit.points
-    stated = np.nan_to_num(points.sigma_ground[:, 2])
     if isinstance(surface, FlatSurface):
         difference = points.ground[:, 2] - surface.height
-        known = np.isfinite(difference)
-        return None, _not_the_ground(difference[known], stated[known], seen)
-    # Matches have the heights of the DEM.
-    measured = points.groups < 0
-    difference, ids = surface.above(points.ground[measured], points.crs), np.array(points.ids)[measured]
-    known = np.isfinite(difference)
-    difference, ids, stated = difference[known], ids[known], stated[measured][known]
+        known = np.abs(difference) > FROM_DEM
+        return None, _not_the_ground(difference[known], np.nan_to_num(points.sigma_ground[known, 2]), seen)
+    difference, ids, stated = _above(points, surface)
     if not len(difference):
         return None, []
     largest = int(np.abs(difference).argmax())
     median, spread = median_and_spread(difference)
-    doubts = datums_apart(difference, points.ground, points.crs, seen["lean_m_per_m"])
-    doubts = doubts or _not_the_ground(difference, stated, seen)
+    own = np.abs(difference) > FROM_DEM
+    doubts = datums_apart(difference[own], points.ground, points.crs, seen["lean_m_per_m"])
+    doubts = doubts or _not_the_ground(difference[own], stated[own], seen)
     warning = str(doubts[0]) if doubts else None
     heights = PointHeights(
         median_m=median,
@@ -269,9 +266,26 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
         warning=warning,
         largest_m=float(difference[largest]),
         largest_at=str(ids[largest]),
-        without=int((~known).sum()),
+        without=int((points.groups < 0).sum()) - len(difference),
     )
     return heights, doubts
+
+
+def datums_of(fit: Fit, surface: Surface | None) -> list[Notice]:
+    """Return a notice if heights of points and of a DEM that gives heights to others differ as if by their datums."""
+    if surface is None or isinstance(surface, FlatSurface):
+        return []
+    difference, _, _ = _above(fit.points, surface)
+    return datums_apart(difference[np.abs(difference) > FROM_DEM], fit.points.ground, fit.points.crs)
+
+
+def _above(points: Points, surface: Surface) -> tuple[Array, NDArray[np.str_], Array]:
+    """Return heights (m) of measured points above a DEM ``(n,)``, their ids, and the sigmas of heights they state."""
+    # Matches have the heights of the DEM.
+    measured = points.select(points.groups < 0)
+    difference = surface.above(measured.ground, measured.crs)
+    known = np.isfinite(difference)
+    return difference[known], np.array(measured.ids)[known], np.nan_to_num(measured.sigma_ground[known, 2])
 
 
 def _not_the_ground(difference: Array, stated: Array, seen: Mapping[str, Any]) -> list[Notice]:

@@ -110,6 +110,27 @@ def test_a_dem_that_is_upside_down_gives_no_accuracy(tmp_path, upside_down):
     assert min(moved, default=50.0) > 40.0
 
 
+@pytest.mark.parametrize("off", [0.0, 30.0])
+def test_heights_from_the_dem_do_not_hide_another_datum(tmp_path, off):
+    """Most points have the heights of the DEM, so the median of all was zero; `ortho fit` compared nothing."""
+    given = json.loads((SAMPLE / "gcps.geojson").read_text())
+    for number, feature in enumerate(given["features"]):
+        place = feature["geometry"]["coordinates"]
+        if number % 3:
+            del place[2]
+        else:
+            place[2] += off
+    (tmp_path / "gcps.geojson").write_text(json.dumps(given))
+    words = (SAMPLE / "scene.tif", "--gcps", tmp_path / "gcps.geojson", "--dem", SAMPLE / "dem.tif")
+    for command, more in (("fit", ()), ("rectify", ("-o", tmp_path / "out"))):
+        done = CliRunner().invoke(cli, [command, *map(str, (*words, *more)), "--json"])
+        assert done.exit_code == 0, done.output
+        document = json.loads(done.stdout)
+        notices = document.get("report", document)["notices"]
+        found = [one["median_m"] for one in notices if one["code"] == "heights-disagree"]
+        assert found == ([pytest.approx(off, abs=5.0)] if off else [])
+
+
 @pytest.mark.parametrize("sigma", [0.0, 30.0])
 def test_points_with_poor_heights_do_not_disprove_a_dem(tmp_path, sigma):
     """Their heights are wrong by 30 m, as they state."""
