@@ -156,10 +156,7 @@ def adjust(
     solved, found, shared = _weighed(solved, inside, shared)
     inside = solved.without_astray(inside)
     notes += _without(points, ~_among(points, set(exclude)) & ~problem.active(inside) & ~judged)
-    notes += [
-        *found.variances.notes(),
-        *marks_warning(points.select(points.check | (problem.active(inside) & inside.ground))),
-    ]
+    notes += [*found.variances.notes(), *marks_warning(points, problem.active(inside) & inside.ground)]
     notes += uncertain_images(solved, stated, shared.added(solved.cofactors)[0])
     fit = _result(solved, found, shared, inside, points, order, chosen, gauge, rejected, notes)
     adjusted = shared.adjusted_dem(fit.heights)

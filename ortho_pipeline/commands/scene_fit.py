@@ -94,7 +94,7 @@ class Adjusted:
             notices += self.matched.notices
         notices += self.notes
         notices += self._doubtful()
-        notices += marks_warning(points.select(points.check | (adjusted.used & points.control)))
+        notices += marks_warning(points, adjusted.used & points.control)
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
         if not inside.all():
             outside = np.array(points.ids)[~inside].tolist()

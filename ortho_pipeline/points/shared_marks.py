@@ -27,6 +27,7 @@ class HasGround(Protocol):
     def crs(self) -> pyproj.CRS: ...
     @property
     def check(self) -> NDArray[np.bool_]: ...
+    def select(self, mask: NDArray[np.bool_], /) -> HasGround: ...
 
 
 def one_mark(points: HasGround) -> list[tuple[str, str]]:
@@ -54,9 +55,9 @@ def one_mark(points: HasGround) -> list[tuple[str, str]]:
     return [(points.ids[first], points.ids[second]) for first, second in sorted(pairs)]
 
 
-def marks_warning(points: HasGround) -> list[Notice]:
-    """Return warnings if control or check points are one mark: the second one neither adds nor tests anything."""
-    pairs = one_mark(points)
+def marks_warning(points: HasGround, used: NDArray[np.bool_]) -> list[Notice]:
+    """Return warnings if used points ``(N,)`` or check points are one mark: the second one neither adds nor tests."""
+    pairs = one_mark(points.select(points.check | used))
     checks = {name for name, check in zip(points.ids, points.check, strict=True) if check}
     tested = [pair for pair in pairs if checks.intersection(pair)]
     added = [pair for pair in pairs if pair not in tested]

@@ -13,6 +13,7 @@ from ortho_pipeline.commands.orthos.aligning import align
 from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.imaging.matching import SceneView, open_references
+from ortho_pipeline.imaging.matching.agreement import said_of_parts
 from ortho_pipeline.imaging.matching.sight import displaced_parts
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
@@ -90,6 +91,15 @@ def test_a_displaced_part_is_in_the_accuracy(tmp_path, moved):
     assert "mostly in the right part of the image" in notice["text"]
     # A model that was not adjusted was named as well.
     assert {cause["code"] for cause in document["causes"]} <= {"step"}
+
+
+@pytest.mark.parametrize(
+    ("far", "said"),
+    [([0.31, 0.33], "0.32 m from"), ([12.2] * 9, "12 m from"), ([2.0, 2.1, 9.0, 9.1], "2 to 9.1 m from")],
+)
+def test_displacements_have_their_own_digits(far, said):
+    # Those of a drone's ortho were "0 m", and parts that had moved differently had one length.
+    assert said in said_of_parts(np.zeros((3, 2)), np.ones((len(far), 2)), np.array(far))
 
 
 @pytest.mark.parametrize("side", [SIDE, 400])

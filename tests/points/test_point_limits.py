@@ -36,14 +36,14 @@ def test_a_mark_is_one_within_a_centimetre(apart_mm: float, same: bool, axis: in
     ground[1:, axis] += apart_mm / 1000 * (1.0 if axis == 2 else 0.9996), 7.0
     points = Points.of([[1, 1], [2, 2], [3, 3]], ground, "EPSG:32636")
     assert one_mark(points) == ([("1", "2")] if same else [])
-    assert bool(marks_warning(points)) is same
+    assert bool(marks_warning(points, points.control)) is same
 
 
 def test_a_check_point_that_is_a_control_point_tests_nothing() -> None:
     ground = np.array([[500_000.0, 4e6, 100.0]] * 2 + [[600_000.0, 4e6, 100.0]] * 2)
     ground[1::2, 2] += 0.005
     points = Points.of(np.eye(4, 2), ground, "EPSG:32636", roles=["control", "check", "control", "control"])
-    added, tested = marks_warning(points)
+    added, tested = marks_warning(points, points.control)
     assert (added.code, added.fields["pairs"]) == ("one-mark-twice", [["3", "4"]])
     assert (tested.code, tested.fields["pairs"]) == ("one-mark-twice", [["1", "2"]])
     assert "tests nothing" in str(tested)

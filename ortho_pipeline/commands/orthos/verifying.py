@@ -387,10 +387,10 @@ def _notices(document: Mapping[str, Any], measured: MeasuredOrtho, reference_sig
     apart = measured.apart
     if apart.any():
         off = measured.displacement[apart] - np.median(measured.displacement[~apart], axis=0)
-        metres = float(np.median(np.hypot(*off.T)))
-        parts = said_of_parts(measured.image[~apart], measured.image[apart], metres)
+        far = np.hypot(*off.T)
+        parts = said_of_parts(measured.image[~apart], measured.image[apart], far)
         text = f"a part of the ortho or of the reference is displaced: {parts}"
-        found.append(Notice("ortho-part-displaced", text, matches=int(apart.sum()), displaced_m=metres))
+        found.append(Notice("ortho-part-displaced", text, matches=int(apart.sum()), displaced_m=float(np.median(far))))
     local = document["matches"]["local"]
     if local > 0.02 * len(measured.image) and local > 2:
         text = f"{counted(local, 'match differs', 'matches differ')} from the neighbouring matches"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
+from ortho_pipeline.display.numbers import significant, size_m
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.imaging.matching.targets import Target
@@ -24,6 +25,8 @@ ACCIDENT = 1e-6
 #: at the other. If the second part of all chips do, and each position has the third part of them, at least the fourth
 #: number, the target is inconsistent: parts of it are displaced.
 _FITS, _DIVIDED, _PART, FEWEST_PART = 0.15, 0.75, 0.1, 4
+#: Displacements are told as one length if nine of ten are less than so many times those of one of ten.
+_ALIKE = 1.5
 
 
 def agreed(
@@ -100,7 +103,7 @@ def divided_between(
     first = fits & ~second
     if fits.sum() < _DIVIDED * len(both) or min(first.sum(), second.sum()) < least_part(len(both)):
         return ""
-    return said_of_parts(centres[first], centres[second], far)
+    return said_of_parts(centres[first], centres[second], np.array([far]))
 
 
 def least_part(chips: int) -> float:
@@ -108,14 +111,16 @@ def least_part(chips: int) -> float:
     return max(FEWEST_PART, _PART * chips)
 
 
-def said_of_parts(first: Array, second: Array, far: float) -> str:
-    """Return in words that chips with the centres `second` match `far` (m) from the position of the first."""
+def said_of_parts(first: Array, second: Array, far: Array) -> str:
+    """Return in words that chips with the centres `second` match `far` ``(n,)`` m from the position of the first."""
     apart = second.mean(axis=0) - first.mean(axis=0)
     axis = int(np.abs(apart).argmax())
     side = (("left", "right"), ("upper", "lower"))[axis][int(apart[axis] > 0)]
+    least, most = np.quantile(far, [0.1, 0.9])
+    length = size_m(float(np.median(far))) if most < _ALIKE * least else f"{significant(least)} to {size_m(most)}"
     return (
         f"{counted(len(first), 'chip matches', 'chips match')} at one position; "
-        f"{counted(len(second), 'chip matches', 'chips match')} {far:.0f} m from there, "
+        f"{counted(len(second), 'chip matches', 'chips match')} {length} from there, "
         f"mostly in the {side} part of the image"
     )
 
