@@ -58,6 +58,7 @@ from ortho_pipeline.report.records import (
 )
 from ortho_pipeline.report.summary import summary_text
 from ortho_pipeline.report.wording import corrected, headline, points_again, refuted
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.flat import FlatSurface
 
 if TYPE_CHECKING:
@@ -65,7 +66,6 @@ if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Scene
     from ortho_pipeline.points import Points
     from ortho_pipeline.raster.source import Grid
-    from ortho_pipeline.surface.base import Surface
     from ortho_pipeline.warp.job import WarpRecord
 
 Array = NDArray[np.float64]
@@ -249,7 +249,7 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
     if isinstance(surface, FlatSurface):
         difference = points.ground[:, 2] - surface.height
         known = np.abs(difference) > FROM_DEM
-        return None, _not_the_ground(difference[known], np.nan_to_num(points.sigma_ground[known, 2]), seen)
+        return None, _not_the_ground(difference[known], _sigmas(points, surface)[known], seen)
     difference, ids, stated = _above(points, surface)
     if not len(difference):
         return None, []
@@ -280,19 +280,26 @@ def datums_of(fit: Fit, surface: Surface | None) -> list[Notice]:
 
 
 def _above(points: Points, surface: Surface) -> tuple[Array, NDArray[np.str_], Array]:
-    """Return heights (m) of measured points above a DEM ``(n,)``, their ids, and the sigmas of heights they state."""
+    """Return heights (m) of measured points above a DEM ``(n,)``, their ids, and the sigmas that both state."""
     # Matches have the heights of the DEM.
     measured = points.select(points.groups < 0)
     difference = surface.above(measured.ground, measured.crs)
     known = np.isfinite(difference)
-    return difference[known], np.array(measured.ids)[known], np.nan_to_num(measured.sigma_ground[known, 2])
+    return difference[known], np.array(measured.ids)[known], _sigmas(measured, surface)[known]
+
+
+def _sigmas(points: Points, surface: Surface) -> Array:
+    """Return what points and surface state of the difference of their heights ``(N,)`` m; 0 where neither does."""
+    sigma = surface.sigma
+    of_surface = sigma.heights(points.ground[:, :2], points.crs) if isinstance(sigma, Surface) else sigma or 0.0
+    return np.asarray(np.hypot(np.nan_to_num(points.sigma_ground[:, 2]), np.nan_to_num(of_surface)))
 
 
 def _not_the_ground(difference: Array, stated: Array, seen: Mapping[str, Any]) -> list[Notice]:
     """Return a notice if the surface is typically far from the points ``(n,)`` m, and that moves the ortho by a pixel.
 
     Flat ground, filled voids and a DEM that is mirrored or of another place are such surfaces. The fit uses the heights
-    of the points and does not see it. Points show nothing within two sigmas ``(n,)`` of the heights that they state.
+    of the points and does not see it. Points show nothing within two sigmas ``(n,)`` that they and the surface state.
     """
     if len(difference) < 3:
         return []

@@ -110,6 +110,15 @@ def test_a_dem_that_is_upside_down_gives_no_accuracy(tmp_path, upside_down):
     assert min(moved, default=50.0) > 40.0
 
 
+@pytest.mark.parametrize(("sigma", "told"), [(None, True), (5.0, True), (100.0, False), (FlatSurface(100.0), False)])
+def test_a_surface_may_be_as_wrong_as_it_states(sigma, told):
+    scene, points = open_scene(SAMPLE / "scene.tif"), read_points(SAMPLE / "gcps.geojson")
+    # The points' own heights are typically 150 m about this one.
+    surface = FlatSurface(float(np.median(points.ground[:, 2]))).with_sigma(sigma)
+    report = build_report(scene=scene, fit=scene.fit(points, "shift"), surface=surface)
+    assert ("surface-not-ground" in [one["code"] for one in report.notices]) == told
+
+
 @pytest.mark.parametrize("off", [0.0, 30.0])
 def test_heights_from_the_dem_do_not_hide_another_datum(tmp_path, off):
     """Most points have the heights of the DEM, so the median of all was zero; `ortho fit` compared nothing."""
