@@ -38,6 +38,7 @@ from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.reliability.blunders import find_blunders
 from ortho_pipeline.block.reliability.datums import doubtful_datums
 from ortho_pipeline.block.reliability.known_points import notices, outlying
+from ortho_pipeline.block.reliability.poses import contradicted_poses
 from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.block.shared.common_error import BlockCommonError
 from ortho_pipeline.block.shared.priors import OWN, SharedPriors
@@ -160,7 +161,7 @@ def adjust(
     notes += uncertain_images(solved, stated, shared.added(solved.cofactors)[0])
     fit = _result(solved, found, shared, inside, points, order, chosen, gauge, rejected, notes)
     adjusted = shared.adjusted_dem(fit.heights)
-    warnings = (*fit.warnings, *doubtful_datums(fit, solved.problem.pseudo))
+    warnings = (*fit.warnings, *doubtful_datums(fit, known := solved.problem.pseudo), *contradicted_poses(fit, known))
     return replace(fit, warnings=warnings, planes=solved.problem.heights, adjusted_dem=adjusted, accuracies=stated_by)
 
 

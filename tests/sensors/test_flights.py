@@ -83,3 +83,13 @@ def test_control_points_with_heights_of_another_datum_are_told(flights: Any, tmp
     found = [str(one) for one in fit.warnings if one.code == "datum-doubtful"]
     assert len(found) == (off > 0)
     assert all("focal length" in text for text in found)
+
+
+def test_angles_that_are_worse_than_stated_are_told(flights: Any, tmp_path: Path):
+    """They are wrong by 3 degrees, so positions move, too."""
+    kind = flights.Kind(options={"vertical": "ellipsoid", "sigmas": "3,0.1"})
+    flight = flights.fly(kind, 4, 2, tmp_path)
+    models = {name: scene.model for name, scene in flight.scenes.items()}
+    priors = {name: scene.priors for name, scene in flight.scenes.items()}
+    found = [one for one in adjust(models, flight.points, priors=priors).warnings if one.code == "poses-contradicted"]
+    assert "angles" in [one.fields["what"] for one in found]

@@ -58,6 +58,11 @@ _LOOK: dict[str, str] = {
         Setting("surface.vertical"),
         "), and the width of the sensor.",
     ),
+    "poses-contradicted": Text(
+        "Check the ties. If they are right, state the true accuracy of the poses with ",
+        Setting("scene.sensor_options", "METRES,DEGREES", key="sigmas"),
+        ".",
+    ),
     "images-left-out": "If you need these images, repair what the message names.",
     "positions-differ": "If the position in use is wrong, remove it from the tags of the photo.",
     "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the ortho "

@@ -1,0 +1,71 @@
+"""Poses that an adjustment moves by more than their stated accuracy: RTK of 2 cm that is wrong by metres."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from ortho_pipeline.block.equations.problem import Pseudo
+from ortho_pipeline.block.reliability.poses import contradicted_poses
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.models.frame.orientation import EXTERIOR
+
+ACCURACIES = np.array([0.02, 0.02, 0.04, 0.05, 0.05, 0.05])
+
+
+def told(moved: np.ndarray, sigmas: np.ndarray = ACCURACIES, held: bool = False) -> list[Notice]:
+    """Return the notices of images whose poses changed so much ``(n, 6)`` from known ones."""
+    count = len(moved)
+    known = np.random.default_rng(9).normal(0, 100, moved.shape)
+    sigmas = np.broadcast_to(sigmas, moved.shape)
+    fit = SimpleNamespace(
+        models={f"p{k}": SimpleNamespace(params=known[k] + moved[k]) for k in range(count)},
+        parameters=[(f"p{k}", name) for k in range(count) for name in EXTERIOR],
+    )
+    pseudo = [
+        Pseudo(6 * k + j, float(known[k, j]), float(sigmas[k, j]), held=held) for k in range(count) for j in range(6)
+    ]
+    return contradicted_poses(fit, pseudo)  # type: ignore[arg-type]
+
+
+def changes(seed: int, count: int = 6) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0, 1, (count, 6)) * ACCURACIES
+
+
+def test_changes_within_their_accuracies_are_not_told():
+    # One in 5,000 would be: two tests, each of one in 10,000.
+    assert sum(len(told(changes(seed))) for seed in range(300)) == 0
+
+
+def test_positions_or_angles_that_move_farther_are_told_with_both_sizes():
+    factors = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
+    (one,) = told(changes(1) * factors)
+    assert (one.code, one.fields["what"], one.fields["count"]) == ("poses-contradicted", "positions", 6)
+    apart = (changes(1) * factors)[:, :3]
+    rms = np.sqrt(np.mean((apart - apart.mean(axis=0)) ** 2))
+    assert np.isclose(one.fields["rms"], rms)
+    assert np.isclose(one.fields["sigma"], np.sqrt(np.mean(ACCURACIES[:3] ** 2)))
+    assert "of 6 images" in str(one)
+    (one,) = told(changes(1) * factors[::-1])
+    assert (one.fields["what"], one.fields["unit"]) == ("angles", "°")
+    assert np.isclose(one.fields["sigma"], np.degrees(0.05))
+
+
+def test_an_error_that_all_images_share_is_none_of_their_accuracy():
+    assert told(changes(2) + 50 * ACCURACIES) == []
+
+
+def test_accuracies_of_images_count_by_themselves():
+    """One image without a fixed RTK solution states metres, and is off by metres."""
+    sigmas = np.tile(ACCURACIES, (6, 1))
+    sigmas[3, :3] = 2.0
+    moved = changes(3)
+    moved[3, :3] = [2.5, -1.5, 2.0]
+    assert told(moved, sigmas) == []
+    assert [one.fields["what"] for one in told(moved)] == ["positions"]
+
+
+def test_what_defines_a_datum_and_a_pose_alone_contradict_nothing():
+    assert told(100 * changes(4), held=True) == []
+    assert told(100 * changes(4, count=1)) == []
