@@ -206,6 +206,26 @@ def test_what_is_no_date_or_list_is_refused(tmp_path):
         read_list(tmp_path / "list.csv")
 
 
+@pytest.mark.parametrize("wrong", ["03/05/2024", "2024"])
+def test_the_error_of_a_date_in_a_list_names_the_list_and_the_line(tmp_path, wrong):
+    """Otherwise people look into the image."""
+    for name in "ab":
+        ortho(tmp_path / f"{name}.tif")
+    (tmp_path / "list.csv").write_text(f"file,date\na.tif,2020-01-05\nb.tif,{wrong}\n")
+    with pytest.raises(InputError, match=f"'{wrong}' is not a date") as error:
+        dated_orthos([tmp_path / "list.csv"])
+    assert (Path(str(error.value.file)), error.value.field) == (tmp_path / "list.csv", "date")
+    assert str(error.value.remedy) == "write the date of line 3 as 2024-05-03"
+
+
+def test_the_error_of_a_date_in_an_item_names_the_item(tmp_path):
+    ortho(tmp_path / "a.tif")
+    (tmp_path / "a.json").write_text(json.dumps({"properties": {"datetime": "yesterday"}}))
+    with pytest.raises(InputError, match="'yesterday' is not a date") as error:
+        dated_orthos([tmp_path])
+    assert Path(str(error.value.file)) == tmp_path / "a.json"
+
+
 def test_the_state_of_an_ortho_behind_a_url_has_its_side_cars(tmp_path):
     path = ortho(tmp_path / "a.tif")
     path.with_name("a.tif.msk").write_bytes(ortho(tmp_path / "mask.tif").read_bytes())

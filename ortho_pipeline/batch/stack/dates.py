@@ -41,11 +41,7 @@ _BYTES = 50_000_000
 #: Columns of a list: of the file, and of its date.
 _FILE, _DATE = ("file", "path", "image", "ortho", "name"), ("date", "datetime", "acquired", "time")
 #: Metadata with the time of acquisition: domain and item, the best first.
-_ITEMS = (
-    ("IMAGERY", "ACQUISITIONDATETIME"),
-    ("", "ACQUISITIONDATETIME"),
-    ("", "acquired"),
-)
+_ITEMS = ("IMAGERY", "ACQUISITIONDATETIME"), ("", "ACQUISITIONDATETIME"), ("", "acquired")
 #: This may be the time of acquisition, or of the last change by any program.
 _WRITTEN = "TIFFTAG_DATETIME"
 _PARTS = {"%Y": r"(?P<Y>\d{4})", "%m": r"(?P<m>\d{2})", "%d": r"(?P<d>\d{2})", "%j": r"(?P<j>\d{3})",
@@ -320,7 +316,7 @@ def read_list(path: str | os.PathLike[str]) -> list[tuple[str, str | None]]:
     Raises
     ------
     InputError
-        If it has no column of files, or a row has no file.
+        If it has no column of files, or a row has no file or what is no date.
     """
     text = decoded(read_bounded(path, _BYTES, remedy="give a list of files"))
     header = next((line for line in text.splitlines() if line.strip()), "")
@@ -347,13 +343,15 @@ def read_list(path: str | os.PathLike[str]) -> list[tuple[str, str | None]]:
         if len(row) <= file or not row[file].strip() or "\0" in row[file]:
             raise InputError("a row of this list has no file", file=path, field=f"line {number}")
         stated = row[date].strip() if date is not None and len(row) > date else ""
+        if stated:
+            time_of(stated, path, f"write the date of line {number} as 2024-05-03")
         name = Location(row[file].strip())
         found.append((name if name.is_address else os.path.join(os.path.dirname(path), name), stated or None))
     return found
 
 
 def _date(
-    one: _Given, pattern: str | None, documents: Sequence[tuple[Any, str]], dataset: Any, scene: Scene
+    one: _Given, pattern: str | None, documents: Sequence[tuple[Any, Place]], dataset: Any, scene: Scene
 ) -> tuple[datetime, str]:
     """Return the date of an ortho, and where it is from."""
     path = one.path
@@ -364,7 +362,7 @@ def _date(
     for document, name in documents:
         text = _stated_in(document)
         if text is not None:
-            return time_of(text, path, _OTHERWISE), name
+            return time_of(text, name, _OTHERWISE), name.name
     acquired = scene.facts.get("acquired")
     if scene.sensor != ORTHO and isinstance(acquired, str):
         return time_of(acquired, path, _OTHERWISE), "metadata"
@@ -386,14 +384,14 @@ def _real(path: str | os.PathLike[str]) -> str:
     return os.fspath(path) if Location(path).is_far else os.path.realpath(path)
 
 
-def _documents(one: _Given) -> list[tuple[Any, str]]:
+def _documents(one: _Given) -> list[tuple[Any, Place]]:
     """Return the STAC item of an image and JSON documents next to it, which may state its date, clouds and sun."""
     path = one.path
     stem = path.stem.removesuffix("_ortho")
     names = [path.with_suffix(".json"), path.with_name(f"{stem}_stac.json"), path.with_name(f"{stem}_report.json")]
     if one.item is not None:
         names = [one.item, *(name for name in names if name != one.item)]
-    return [(read_json(name, _BYTES, "repair or delete this file"), name.name) for name in names if name.is_file()]
+    return [(read_json(name, _BYTES, "repair or delete this file"), name) for name in names if name.is_file()]
 
 
 def _stated_in(document: Any) -> str | None:
