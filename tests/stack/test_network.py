@@ -128,6 +128,17 @@ def test_a_cloud_at_one_date_is_not_motion():
     assert not stack.motion.moving[[40, 70, 100]].any()
 
 
+def test_a_part_of_one_date_that_is_displaced_is_not_motion():
+    """Half of the edges across a step are those of one date next to it."""
+    made = Truth(seed=30, dates=16, interval=30.0, hidden=0.0).made()
+    part = made.truth.cells.place[:, 0] < -0.6
+    away = 3.0 * part[:, None]
+    value = made.edges.value + away * ((made.edges.first == 7) * 1.0 - (made.edges.second == 7))[:, None, None]
+    stack = adjust(made.truth.cells, dataclasses.replace(made.edges, value=value), made.years.tolist())
+    assert part.sum() >= 20
+    assert not stack.motion.moving[part].any()
+
+
 def test_only_dates_with_significant_slopes_get_them():
     made, stack = solved(seed=4, dates=16, sloped=3)
     np.testing.assert_array_equal(stack.sloped, np.abs(made.slopes).max(axis=(1, 2)) > 0)

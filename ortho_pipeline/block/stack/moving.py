@@ -185,6 +185,8 @@ def motion_of(
         change = change - np.median(change[seen & ~moving] if (seen & ~moving).any() else change[seen], axis=0)
         here = (change**2).sum(axis=1) / np.maximum(variance * noisier, 1e-300)
         found = seen & (here > crit) & (np.hypot(*change.T) > LEAST)
+        if name == "step" and found.any():
+            found &= here > _of_single_date(without, course, time, noisier)
         better = found & (~moving | (here > ratio))
         form[better] = name
         ratio = np.where(better, here, ratio)
@@ -214,6 +216,20 @@ def left_of(
         edges.first,
         edges.second,
     )
+
+
+def _of_single_date(left: Left, step: Array, time: Array, noisier: Array) -> Array:
+    """Return the largest ratio ``(K,)`` of a change of one date alone, of the dates next to a step ``(T,)``.
+
+    Up to half of the edges across a step are those of one of these dates. So a part of one ortho that is displaced, as
+    in a mosaic, looks like a step, too.
+    """
+    before, after = np.unique(time[step == 0])[-_BESIDE:], np.unique(time[step > 0])[:_BESIDE]
+    ratios = []
+    for date in np.flatnonzero(np.isin(time, [*before, *after])):
+        change, variance, _ = left.change((np.arange(len(time)) == date).astype(float))
+        ratios.append((change**2).sum(axis=1) / np.maximum(variance * noisier, 1e-300))
+    return np.asarray(np.max(ratios, axis=0))
 
 
 def _by_place(values: Array) -> Array:
