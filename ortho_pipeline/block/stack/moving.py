@@ -124,6 +124,11 @@ class Left:
         """Values ``(K, 2, E)`` and weights ``(K, E)``."""
         return _by_place(self.value), _by_place(self.weight)
 
+    def at(self, some: NDArray[np.bool_]) -> Left:
+        """Return the same of some places."""
+        value, weight, own = (array[:, some] for array in (self.value, self.weight, self.own))
+        return replace(self, value=value, weight=weight, own=own, shared=self.shared[some])
+
     def change(self, form: Array) -> tuple[Array, Array, Array]:
         """Return how much of a form ``(T,)`` each place has ``(K, 2)``, its variance ``(K,)`` and what is left."""
         apart = form[self.first] - form[self.second]
@@ -186,7 +191,7 @@ def motion_of(
         here = (change**2).sum(axis=1) / np.maximum(variance * noisier, 1e-300)
         found = seen & (here > crit) & (np.hypot(*change.T) > LEAST)
         if name == "step" and found.any():
-            found &= here > _of_single_date(without, course, time, noisier)
+            found[found] = here[found] > _of_single_date(without.at(found), course, time, noisier[found])
         better = found & (~moving | (here > ratio))
         form[better] = name
         ratio = np.where(better, here, ratio)
