@@ -240,6 +240,12 @@ def _notices(dates: Sequence[Dated], stack: AdjustedStack, matched: Sequence[Dat
         size = float(np.hypot(*step.size))
         text = f"from {dates[step.date].name} on, all orthos are displaced by {size:.1f} px relative to those before"
         found.append(Notice("stack-step", text, date=dates[step.date].name, size_px=list(step.size)))
+    for part in stack.parts:
+        name, size = dates[part.date].name, float(np.hypot(*part.shift))
+        text = (
+            f"{part.cells} of {counted(part.of, 'cell')} of {name} are displaced by {size:.1f} px from the rest of it"
+        )
+        found.append(Notice("stack-part-displaced", text, date=name, cells=part.cells, shift_px=list(part.shift)))
     moving = int(stack.motion.moving.sum())
     if moving > 0.4 * max(int(stack.motion.tested.sum()), 1):
         text = f"{moving} of {counted(int(stack.motion.tested.sum()), 'cell')} move, so the stable ground is uncertain"

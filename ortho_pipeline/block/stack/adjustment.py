@@ -14,6 +14,7 @@ from ortho_pipeline.block.stack.components import ErrorComponents, components_of
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.moving import Left, Motion, left_of, motion_of
 from ortho_pipeline.block.stack.network import Closures, Network, accepted_edges, solve
+from ortho_pipeline.block.stack.parts import DatePart, parts_of
 from ortho_pipeline.block.stack.steps import DateStep, steps_of
 from ortho_pipeline.block.stack.trends import Trends, design_of, trends_of
 from ortho_pipeline.models.base import Array
@@ -48,6 +49,7 @@ class AdjustedStack:
     closures: Closures
     motion: Motion
     steps: tuple[DateStep, ...]
+    parts: tuple[DatePart, ...]
     determined: NDArray[np.bool_]
     sloped: NDArray[np.bool_]
 
@@ -163,10 +165,12 @@ def _referred(
     cells: Cells, solved: _Solved, motion: Motion, years: Array, datum: int | None, sloped: NDArray[np.bool_]
 ) -> AdjustedStack:
     """Return a stack with its datum."""
-    changes = CommonChanges(solved.left(years), solved.edges, solved.trends, solved.components, cells.place, years)
+    left = solved.left(years)
+    changes = CommonChanges(left, solved.edges, solved.trends, solved.components, cells.place, years)
     of_seasons = solved.components.of_seasons(solved.edges.alike[solved.trends.good])
     found = solved.network.with_seasons(of_seasons, changes.yearly_variances(), years)
-    drift = changes.drift(motion.touched(cells), solved.linked(years))
+    touched = motion.touched(cells)
+    drift = changes.drift(touched, solved.linked(years))
     found = found.with_drift(drift.rate, drift.variance, drift.time)
     motion = replace(motion, sigma=np.hypot(motion.sigma, np.sqrt(drift.variance)))
     known = np.isfinite(years)
@@ -184,7 +188,8 @@ def _referred(
     order = np.flatnonzero(determined & known)
     shifts = network.covariance[:, 3 * order][:, :, 3 * order]
     steps = tuple(replace(one, date=int(order[one.date])) for one in steps_of(value[order, 0], shifts))
+    parts = tuple(one for one in parts_of(cells, left, motion.tested & ~touched) if determined[one.date])
     return AdjustedStack(
-        cells, solved.edges, network, solved.components, solved.trends, solved.closures, motion, steps, determined,
-        sloped if datum is None else sloped | bool(sloped[datum]),
+        cells, solved.edges, network, solved.components, solved.trends, solved.closures, motion, steps, parts,
+        determined, sloped if datum is None else sloped | bool(sloped[datum]),
     )  # fmt: skip

@@ -30,7 +30,7 @@ _FEWEST, _STEPS = 4, 10
 #: Squared sigmas within which places share a rate.
 _ALIKE = 9.2
 #: An area of so many cells touches its neighbours (fewer can be found by chance). What is next to a cell.
-_AREA, _NEXT = 4, np.ones((3, 3))
+AREA, NEXT = 4, np.ones((3, 3))
 #: Seasons repeat if the dates span so many years.
 WAVE = 1.5
 #: A step has so many dates on each side. What is left is clipped at so many sigmas, so many times.
@@ -64,13 +64,13 @@ class Motion:
         columns, rows = cells.shape
         large = np.zeros(len(self.moving), dtype=bool)
         for area in self.areas(cells):
-            large[area] = len(area) >= _AREA
-        return np.asarray(ndimage.binary_dilation(large.reshape(rows, columns), _NEXT).ravel() | self.moving)
+            large[area] = len(area) >= AREA
+        return np.asarray(ndimage.binary_dilation(large.reshape(rows, columns), NEXT).ravel() | self.moving)
 
     def areas(self, cells: Cells) -> list[NDArray[np.int_]]:
         """Return connected moving cells, largest area first."""
         columns, rows = cells.shape
-        numbered, count = ndimage.label(self.moving.reshape(rows, columns), structure=_NEXT)
+        numbered, count = ndimage.label(self.moving.reshape(rows, columns), structure=NEXT)
         found = [np.flatnonzero(numbered.ravel() == number + 1) for number in range(count)]
         return sorted(found, key=lambda one: (-len(one), one[0]))
 
@@ -82,7 +82,7 @@ class Motion:
         """
         columns, rows = cells.shape
         still = (self.tested & ~self.moving).reshape(rows, columns)
-        inner = area[~ndimage.binary_dilation(still, _NEXT).ravel()[area]]
+        inner = area[~ndimage.binary_dilation(still, NEXT).ravel()[area]]
         fast = np.hypot(*self.rate[area].T) - 1.96 * self.sigma[area].max(axis=1)
         return inner if len(inner) else area[[int(fast.argmax())]]
 

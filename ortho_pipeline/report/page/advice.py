@@ -76,6 +76,8 @@ _LOOK: dict[str, str] = {
     "stack-pairs-unmatched": Text("Give orthos with less cloud, or search farther with ", Setting("match.search"), "."),
     "stack-pairs-disagree": "Add dates, so that more loops test each pair.",
     "stack-step": "Check whether the processing of the orthos changed then. The stack corrects the step.",
+    "stack-part-displaced": "Look at this date there: the stack does not correct it. If a tile of a mosaic or a cloud "
+    "moved, leave the date out.",
     "stack-mostly-moving": "Check that the area has stable ground, or stack a larger area.",
     "ortho-part-displaced": "Find out which of the two is wrong there. If clouds or glaciers moved, leave them out "
     "with a mask.",
