@@ -316,7 +316,7 @@ def read_list(path: str | os.PathLike[str]) -> list[tuple[str, str | None]]:
     Raises
     ------
     InputError
-        If it has no column of files, or a row has no file or what is no date.
+        If it has no column of files, or a row has no file or a wrong date.
     """
     text = decoded(read_bounded(path, _BYTES, remedy="give a list of files"))
     header = next((line for line in text.splitlines() if line.strip()), "")
