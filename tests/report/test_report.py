@@ -89,6 +89,7 @@ class FakeSurface:
     """The terrain, lower or higher by a constant."""
 
     provenance: dict[str, Any] = {"path": "dem.tif", "crs": "WGS 84", "vertical_label": "EGM96", "fill": "error"}  # noqa: RUF012
+    sigma = None
 
     def __init__(self, offset: float) -> None:
         self.offset = offset

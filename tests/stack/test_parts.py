@@ -59,13 +59,15 @@ def test_two_pairs_do_not_tell_which_date_has_the_part():
 
 @pytest.mark.parametrize("moved", [0, 4])
 def test_the_notice_names_the_date(tmp_path: Path, moved: int) -> None:
-    paths = Rasters(side=300, dates=5, error=4.0).write(tmp_path / "in")
+    paths = Rasters(side=240, dates=4, error=4.0).write(tmp_path / "in")
     opened = gdal.Open(str(paths[2]), gdal.GA_Update)
     pixels = opened.ReadAsArray()
-    pixels[:, 190:] = np.roll(pixels[:, 190:], moved, axis=0)
+    pixels[:, 150:] = np.roll(pixels[:, 150:], moved, axis=0)
     opened.GetRasterBand(1).WriteArray(pixels)
     opened = None
-    done = stack([tmp_path / "in"], tmp_path / "out", StackOptions(corrections_only=True), match=MatchOptions(points=200))
+    done = stack(
+        [tmp_path / "in"], tmp_path / "out", StackOptions(corrections_only=True), match=MatchOptions(points=120)
+    )
     found = [one for one in done.document["notices"] if one["code"] == "stack-part-displaced"]
     assert [one["date"] for one in found] == ([paths[2].stem] if moved else [])
     if moved:
