@@ -12,6 +12,7 @@ import numpy as np
 
 from ortho_pipeline.block.equations.problem import Pseudo
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.reliability.poses import changes_of
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors.texts import counted
@@ -34,15 +35,12 @@ def doubtful_datums(fit: BlockFit, pseudo: Sequence[Pseudo]) -> list[Notice]:
     pseudo : sequence of Pseudo
         What was known of the parameters.
     """
-    params = np.concatenate([np.zeros(0), *(model.params for model in fit.models.values())])
     own, residuals = np.hypot(fit.points.sigma_ground, fit.ground_sigmas), fit.object_residuals
     of_points, of_cameras, signs = list[str](), list[str](), list[str]()
     for axis, (what, name) in enumerate(zip(("east", "north", "in height"), EXTERIOR[:3], strict=True)):
         rows = fit.used_ground & np.isfinite(residuals[:, axis] + own[:, axis])
         of_points += _alike(what, residuals[rows, axis], own[rows, axis])
-        known = [one for one in pseudo if fit.parameters[one.column][1] == name and not one.held]
-        moved = np.array([params[one.column] - one.mean for one in known])
-        of_cameras += _alike(what, moved, np.array([one.sigma for one in known]))
+        of_cameras += _alike(what, *changes_of(name, fit, pseudo))
     if of_points:
         who = counted(int(fit.used_ground.sum()), "control point")
         signs.append(f"{who} differ alike from the block, by {' and '.join(of_points)}")

@@ -13,6 +13,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.statistics import rms
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.frame.orientation import EXTERIOR
 
 #: Probability of changes of poses as large as these, if the stated accuracies are right.
@@ -33,18 +34,15 @@ def contradicted_poses(fit: BlockFit, pseudo: Sequence[Pseudo]) -> list[Notice]:
     """
     from scipy.special import chdtrc
 
-    params = np.concatenate([np.zeros(0), *(model.params for model in fit.models.values())])
     found = []
     for what, names, size, unit in (("positions", EXTERIOR[:3], 1.0, "m"), ("angles", EXTERIOR[3:], _DEGREES, "°")):
         changes, accuracies, freedom, images = np.zeros(0), np.zeros(0), 0, 0
         for name in names:
-            known = [one for one in pseudo if fit.parameters[one.column][1] == name and not one.held]
-            if len(known) > 1:
-                sigmas = np.array([one.sigma for one in known])
-                moved = np.array([params[one.column] - one.mean for one in known])
+            moved, sigmas = changes_of(name, fit, pseudo)
+            if len(moved) > 1:
                 changes = np.append(changes, moved - np.average(moved, weights=sigmas**-2.0))
                 accuracies = np.append(accuracies, sigmas)
-                freedom, images = freedom + len(known) - 1, max(images, len(known))
+                freedom, images = freedom + len(moved) - 1, max(images, len(moved))
         if not freedom or chdtrc(freedom, np.sum((changes / accuracies) ** 2)) >= _CHANCE:
             continue
         by, within = rms(changes) * size, rms(accuracies) * size
@@ -55,3 +53,10 @@ def contradicted_poses(fit: BlockFit, pseudo: Sequence[Pseudo]) -> list[Notice]:
         )
         found.append(Notice("poses-contradicted", text, what=what, rms=by, sigma=within, unit=unit, count=images))
     return found
+
+
+def changes_of(name: str, fit: BlockFit, pseudo: Sequence[Pseudo]) -> tuple[Array, Array]:
+    """Return by how much an adjustment changed a parameter of images ``(n,)``, and the sigmas known before."""
+    params = np.concatenate([np.zeros(0), *(model.params for model in fit.models.values())])
+    known = [one for one in pseudo if fit.parameters[one.column][1] == name and not one.held]
+    return np.array([params[one.column] - one.mean for one in known]), np.array([one.sigma for one in known])

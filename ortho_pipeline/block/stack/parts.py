@@ -40,14 +40,15 @@ def parts_of(cells: Cells, left: Left, still: NDArray[np.bool_]) -> list[DatePar
         ends = np.flatnonzero((left.first == date) | (left.second == date))
         sign = np.where(left.first[ends] == date, 1.0, -1.0)
         seen = left.weight[ends] > 0
-        known = still & (seen.sum(axis=0) >= _FEWEST)
+        count = seen.sum(axis=0)
+        known = still & (count >= _FEWEST)
         if not known.any():
             continue
         value = np.where(seen[:, known, None], sign[:, None, None] * left.value[ends][:, known], np.nan)
         shift = np.zeros((len(still), 2))
         shift[known] = np.nanmedian(value, axis=0)
         # A median has pi / 2 times the variance of a mean.
-        of_edges = np.pi / 2 * (left.own[ends] * seen).sum(axis=0) / np.maximum(seen.sum(axis=0), 1) ** 2
+        of_edges = np.pi / 2 * (left.own[ends] * seen).sum(axis=0) / np.maximum(count, 1) ** 2
         variance = (left.scale[date] * left.shared + of_edges) * left.noisier
         far = known & (np.hypot(*shift.T) > _LEAST) & ((shift**2).sum(axis=1) > limit * variance)
         area = ndimage.label(far.reshape(cells.shape[::-1]), NEXT)[0].ravel()

@@ -14,7 +14,7 @@ from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 Array = NDArray[np.float64]
 #: Median of control height minus DEM height from which a difference of datums is suspected, metres.
 _SUSPICIOUS_HEIGHT = 5.0
-#: A height that is nearer to the DEM's (m) was taken from it, and says nothing of it.
+#: Points nearer to the DEM than this (m) have their heights from it, so they do not test it.
 FROM_DEM = 1e-6
 
 
