@@ -248,16 +248,14 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
     points = fit.points
     if isinstance(surface, FlatSurface):
         difference = points.ground[:, 2] - surface.height
-        known = np.abs(difference) > FROM_DEM
-        return None, _not_the_ground(difference[known], _sigmas(points, surface)[known], seen)
+        return None, _not_the_ground(difference, _sigmas(points, surface), seen)
     difference, ids, stated = _above(points, surface)
     if not len(difference):
         return None, []
     largest = int(np.abs(difference).argmax())
     median, spread = median_and_spread(difference)
-    own = np.abs(difference) > FROM_DEM
-    doubts = datums_apart(difference[own], points.ground, points.crs, seen["lean_m_per_m"])
-    doubts = doubts or _not_the_ground(difference[own], stated[own], seen)
+    doubts = datums_apart(difference, points.ground, points.crs, seen["lean_m_per_m"])
+    doubts = doubts or _not_the_ground(difference, stated, seen)
     warning = str(doubts[0]) if doubts else None
     heights = PointHeights(
         median_m=median,
@@ -276,7 +274,7 @@ def datums_of(fit: Fit, surface: Surface | None) -> list[Notice]:
     if surface is None or isinstance(surface, FlatSurface):
         return []
     difference, _, _ = _above(fit.points, surface)
-    return datums_apart(difference[np.abs(difference) > FROM_DEM], fit.points.ground, fit.points.crs)
+    return datums_apart(difference, fit.points.ground, fit.points.crs)
 
 
 def _above(points: Points, surface: Surface) -> tuple[Array, NDArray[np.str_], Array]:
@@ -301,6 +299,8 @@ def _not_the_ground(difference: Array, stated: Array, seen: Mapping[str, Any]) -
     Flat ground, filled voids and a DEM that is mirrored or of another place are such surfaces. The fit uses the heights
     of the points and does not see it. Points show nothing within two sigmas ``(n,)`` that they and the surface state.
     """
+    own = np.abs(difference) > FROM_DEM
+    difference, stated = difference[own], stated[own]
     if len(difference) < 3:
         return []
     typical, worst = 1.4826 * float(np.median(np.abs(difference))), float(np.abs(difference).max())

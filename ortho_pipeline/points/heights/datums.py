@@ -24,12 +24,13 @@ def datums_apart(difference: Array, ground: Array, crs: pyproj.CRS, displacement
     Parameters
     ----------
     difference : ndarray (n,)
-        Heights of points above the DEM, m.
+        Heights of points above the DEM, m. Those that come from the DEM do not count.
     ground : ndarray (N, 3)
         Points that show where that is, in `crs`.
     displacement : float, optional
         Metres in the ortho for each metre of height.
     """
+    difference = difference[np.abs(difference) > FROM_DEM]
     if len(difference) < 3:
         return []
     median, spread = median_and_spread(difference)
