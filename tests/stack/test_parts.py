@@ -41,6 +41,19 @@ def test_a_displaced_part_of_one_date_is_told(share):
     assert np.abs(stack.network.value[:, 0] - others.network.value[:, 0]).max() < 0.03
 
 
+@pytest.mark.parametrize("shift", [1.5, 3.0])
+def test_a_displaced_half_of_one_date_is_no_slope(shift):
+    """Nothing shows which half is right, so the correction is between them, and its sigma covers both."""
+    stack = solved(0.5, shift)
+    (part,) = stack.parts
+    assert (part.date, part.cells, part.of) == (AT, 72, 144)
+    assert np.abs(part.shift) == pytest.approx((shift, 0.0), abs=0.15)
+    assert not stack.sloped.any()
+    error = stack.network.value[AT, 0, 0] - solved(0.0, 0.0).network.value[AT, 0, 0]
+    assert 0.25 * shift < error < 0.75 * shift
+    assert stack.sigma[AT, 0] > 0.2 * shift
+
+
 @pytest.mark.parametrize(("share", "shift"), [(0.0, 0.0), (0.2, 0.3), (1.0, 3.0)])
 def test_a_whole_date_and_small_displacements_are_no_part(share, shift):
     assert solved(share, shift).parts == ()

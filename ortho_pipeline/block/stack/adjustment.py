@@ -14,7 +14,7 @@ from ortho_pipeline.block.stack.components import ErrorComponents, components_of
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.moving import Left, Motion, left_of, motion_of
 from ortho_pipeline.block.stack.network import Closures, Network, accepted_edges, solve
-from ortho_pipeline.block.stack.parts import DatePart, parts_of
+from ortho_pipeline.block.stack.parts import DatePart, parts_of, smaller_part
 from ortho_pipeline.block.stack.steps import DateStep, steps_of
 from ortho_pipeline.block.stack.trends import Trends, design_of, trends_of
 from ortho_pipeline.models.base import Array
@@ -100,6 +100,9 @@ def adjust(
             break
         stable = ~motion.moving
     sloped = _sloped(edges, three, place, stable, dates) if affine else none
+    left = solved.left(times)
+    for date in np.flatnonzero(sloped):
+        sloped[date] = not smaller_part(left, int(date), stable, three).any()
     for _ in range(_ROUNDS):
         solved = _Solved.of(edges, three if sloped.any() else one, place, stable, sloped)
         motion = motion_of(solved.left(times), times)
@@ -188,7 +191,8 @@ def _referred(
     order = np.flatnonzero(determined & known)
     shifts = network.covariance[:, 3 * order][:, :, 3 * order]
     steps = tuple(replace(one, date=int(order[one.date])) for one in steps_of(value[order, 0], shifts))
-    parts = tuple(one for one in parts_of(cells, left, motion.tested & ~touched) if determined[one.date])
+    still, design = motion.tested & ~touched, design_of(cells.place, 3)
+    parts = tuple(one for one in parts_of(cells, left, still, design) if determined[one.date])
     return AdjustedStack(
         cells, solved.edges, network, solved.components, solved.trends, solved.closures, motion, steps, parts,
         determined, sloped if datum is None else sloped | bool(sloped[datum]),
