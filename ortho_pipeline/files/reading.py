@@ -76,13 +76,15 @@ def why_no_file(name: str) -> str:
 def decoded(data: bytes) -> str:
     """Return text that ought to be UTF-8 but may be Latin-1: what is read of it is ASCII, its names need not be.
 
+    PowerShell and spreadsheets write UTF-16, with its mark at the beginning.
+
     Examples
     --------
     >>> decoded("Büyüksalih".encode("latin-1"))
     'Büyüksalih'
     """
     try:
-        return data.decode("utf-8-sig")
+        return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
 

@@ -122,6 +122,24 @@ def test_assets_of_one_name_have_the_ids_of_their_items(tmp_path):
     assert "STAC item of each, with an id of its own" in str(caught.value.remedy)
 
 
+def test_two_items_of_one_image_are_refused(tmp_path):
+    ortho(tmp_path / "a.tif")
+    for name, day in (("x", "05"), ("y", "06")):
+        item = {"type": "Feature", "stac_version": "1.0.0", "id": name, "assets": {"b": {"href": "a.tif"}}}
+        item["properties"] = {"datetime": f"2020-01-{day}T00:00:00Z"}
+        (tmp_path / f"{name}.json").write_text(json.dumps(item))
+    with pytest.raises(InputError, match=r"another STAC item names this image, too: x\.json") as error:
+        dated_orthos([tmp_path / "x.json", tmp_path / "y.json", tmp_path / "x.json"])
+    assert Path(str(error.value.file)) == tmp_path / "y.json"
+
+
+def test_a_list_in_utf_16_is_read(tmp_path):
+    """PowerShell and spreadsheets write such lists."""
+    for name in ("utf-16", "utf-8-sig"):
+        (tmp_path / "list.csv").write_text("file,date\nİ.tif,2020-01-05\n", encoding=name)
+        assert read_list(tmp_path / "list.csv") == [(str(tmp_path / "İ.tif"), "2020-01-05")]
+
+
 def test_an_image_with_two_dates_in_lists_is_refused(tmp_path):
     for name in "ab":
         ortho(tmp_path / f"{name}.tif")
@@ -189,6 +207,8 @@ def test_patterns(name, pattern, day):
     [
         ("a.tif", "%Y"), ("a_2020.tif", "%q"), ("a_20201399.tif", "%Y%m%d"), ("a_81750322.tif", "%Y%m%d"),
         ("a_920200101920210101.tif", "%Y%m%d"), ("a_2023366.tif", "%Y%j"), ("a_20240503.tif", "%Y%M%d"),
+        # A day of the year within a date, or without the day of it.
+        ("a_20240503.tif", "%Y%j"), ("a_20240503.tif", "%Y%m"),
     ],
 )  # fmt: skip
 def test_patterns_that_do_not_fit_are_refused(name, pattern):

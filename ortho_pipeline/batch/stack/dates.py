@@ -195,8 +195,15 @@ class _Given:
         Raises
         ------
         InputError
-            If the other one states another date.
+            If the other one states another date, or is from another STAC item.
         """
+        if self.item is not None and other.item is not None and self.item != other.item:
+            raise InputError(
+                f"another STAC item names this image, too: {Path(self.item).name}",
+                file=other.item,
+                field="orthos",
+                remedy="give one of the two items",
+            )
         if self.stated and other.stated and time_of(self.stated, self.path) != time_of(other.stated, self.path):
             raise InputError(
                 f"lists give this image two dates: {self.stated} and {other.stated}",

@@ -54,7 +54,7 @@ def by_pattern(name: str, pattern: str) -> datetime:
     Raises
     ------
     InputError
-        If the pattern has no year, or does not occur in the name.
+        If the pattern has no year, does not occur in the name, or takes a part of a whole date there.
     """
     parts = re.split(r"(%[a-zA-Z%])", pattern)
     codes = [part for part in parts if part.startswith("%") and len(part) == 2]
@@ -76,6 +76,12 @@ def by_pattern(name: str, pattern: str) -> datetime:
     valid = [(span, time) for span, time in found.items() if time is not None and time.year in _YEARS]
     # Archives put the day of acquisition before that of processing.
     alone = [time for span, time in valid if not _is_within(name, *span)]
+    if not alone and "%d" not in codes and (whole := _whole_date(name)):
+        raise InputError(
+            f"the pattern {pattern} takes a part of {whole} in the name {name}",
+            field="stack.date_pattern",
+            remedy="such as %Y%m%d for 20240503",
+        )
     times = alone[:1] or list(dict.fromkeys(time for _, time in valid))
     if len(times) != 1:
         what = f"{len(times)} dates" if times else "no valid date"
@@ -85,6 +91,12 @@ def by_pattern(name: str, pattern: str) -> datetime:
             remedy="add more characters of the name to the pattern, or give a CSV file with the columns file and date",
         )
     return times[0]
+
+
+def _whole_date(name: str) -> str | None:
+    """Return a number of a name that is a year, a month and a day, and nothing else."""
+    found = re.finditer(r"(?<!\d)(?P<Y>\d{4})(?P<m>\d{2})(?P<d>\d{2})(?!\d)", name)
+    return next((match[0] for match in found if (time := _time_in(match)) and time.year in _YEARS), None)
 
 
 def _time_in(match: re.Match[str]) -> datetime | None:
