@@ -28,6 +28,7 @@ from ortho_pipeline.batch.config import read_config
 from ortho_pipeline.batch.plan import plan
 from ortho_pipeline.batch.runner import run as run_pipeline
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.orthos.aligning import align
 from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.commands.sharpening.registration import Agreement, displaced
@@ -542,14 +543,27 @@ def _bands(printed: Printed, folder: Path) -> None:
     assert gdal.Open(str(folder / "ms.vrt")).RasterCount == 4
 
 
-@case("commands", "ortho align")
-def _displaced(printed: Printed, folder: Path) -> None:
+def _sharpened_badly(folder: Path, ratio: int | None) -> str:
     pan, coarse = folder / "pan.tif", folder / "ms.tif"
     gdal.Translate(str(pan), str(SAMPLE / "reference.tif"), srcWin=[100, 100, 400, 400])
-    gdal.Translate(str(coarse), str(pan), widthPct=50, heightPct=50, resampleAlg="average")
-    notice = displaced(Agreement((0.7, 0.0), (0.02, 0.02), 0.7, 90, 100), "pan.tif", "ms.tif")
-    printed.paste(notice)
+    band = gdal.Translate("", str(pan), format="MEM", widthPct=50, heightPct=50, resampleAlg="average")
+    wide = {"width": 400, "height": 400} if ratio else {}
+    gdal.Translate(str(coarse), band, bandList=[1, 1, 1], **wide)
+    return str(displaced(Agreement((0.7, 0.0), (0.02, 0.02), 0.7, 90, 100), "pan.tif", "ms.tif", ratio))
+
+
+@case("commands", "ortho align")
+def _displaced(printed: Printed, folder: Path) -> None:
+    printed.paste(_sharpened_badly(folder, None))
     assert (folder / "aligned" / "ms_aligned.tif").is_file()
+
+
+@case("commands", "ortho sharpen")
+def _sharpened_again(printed: Printed, folder: Path) -> None:
+    text = _sharpened_badly(folder, 2)
+    align(folder / "ms.tif", folder / "aligned", match=MatchOptions(reference=("pan.tif",)))
+    printed.paste(text)
+    assert (folder / "sharpened" / "pan_sharpened.tif").is_file()
 
 
 def _combined(*paths: Path) -> Mosaic:

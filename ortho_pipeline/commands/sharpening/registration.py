@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -74,12 +75,22 @@ def measure_agreement(
     return Agreement((column, row), (across, down), rmse, len(measured.image), tried)
 
 
-def displaced(agreement: Agreement, pan: str | os.PathLike[str], colours: str | os.PathLike[str]) -> Notice | None:
-    """Return the warning about orthos that do not agree; None if they do."""
+def displaced(
+    agreement: Agreement, pan: str | os.PathLike[str], colours: str | os.PathLike[str], ratio: int | None = None
+) -> Notice | None:
+    """Return the warning about orthos that do not agree; None if they do.
+
+    Parameters
+    ----------
+    ratio : int, optional
+        Panchromatic pixels along an original multispectral one, where the multispectral ortho has panchromatic pixels.
+    """
     if agreement.rmse <= LIMIT:
         return None
+    moved, more = typed(Path("aligned", f"{Path(colours).stem}_aligned.tif")), f" --ratio {ratio}" if ratio else ""
     text = Text(
         f"the multispectral ortho is displaced by {agreement.rmse:.2f} panchromatic px (limit {LIMIT} px), so colours "
-        f"are next to their objects. Align it first: `ortho align {typed(colours)} --reference {typed(pan)} -o aligned`"
+        f"are next to their objects. Align it: `ortho align {typed(colours)} --reference {typed(pan)} -o aligned`. "
+        f"Then sharpen again: `ortho sharpen {typed(pan)} {moved}{more} -o sharpened`"
     )
     return Notice("sharpen-displaced", text, rmse_px=agreement.rmse, limit_px=LIMIT)

@@ -314,7 +314,8 @@ def _agreement(pair: OrthoPair, regression: Weights) -> tuple[Agreement | None, 
             ) from error
         text = f"the registration of the orthos is unknown: they could not be matched ({error.message})"
         return None, [Notice("sharpen-not-matched", text)]
-    notices = [] if (notice := displaced(agreement, *pair.paths)) is None else [notice]
+    ratio = pair.whole_ratio if _own_ratio(pair.grids) < _LEAST_RATIO else None
+    notices = [] if (notice := displaced(agreement, *pair.paths, ratio)) is None else [notice]
     if not alike:
         text = f"the multispectral bands explain only {share:.0%} of the panchromatic variance; colours can be wrong"
         notices.append(Notice("sharpen-unlike", text, explained=share))
