@@ -273,7 +273,7 @@ def test_points_of_several_images_are_listed_and_go_to_the_adjustment(tmp_path):
     gcps.write_text("\n".join(["EPSG:32636", *lines]))
     said = run("info", tmp_path).stdout
     assert "incomplete: the height datum of these points is unknown" in said
-    assert f"ortho adjust {tmp_path} --ties auto --dem {tmp_path / 'dem.tif'} --points {gcps} --orthos" in said
+    assert f"ortho adjust {tmp_path} --ties auto --dem {tmp_path / 'dem.tif'} --points {gcps} --dem-fill mask" in said
     for number in (2, 3):
         (tmp_path / f"photos/photo{number}.jpg").unlink()
     said = run("info", tmp_path).stdout

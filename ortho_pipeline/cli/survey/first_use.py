@@ -204,6 +204,8 @@ def next_steps(seen: FolderSurvey) -> list[str]:
         return [*notes, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
     frames = [file for file in seen.found if file.kind == "scene" and "frame" in file.models]
     if block or (len(frames) == len(scenes) and not points):
+        # Photos at the rim show more than a surface model that was made of them.
+        words += ["--dem-fill", "mask"] if frames and dems else []
         line = shlex.join(["ortho", "adjust", str(seen.folder), "--ties", "auto", *words, "--orthos", "-o", "out"])
         what = counted(len(scenes), "photo" if len(frames) == len(scenes) else "scene")
         return [*notes, f"Adjust the {what} together, and make their orthos:", f"  {line}"]
