@@ -54,6 +54,17 @@ def test_a_displaced_half_of_one_date_is_no_slope(shift):
     assert stack.sigma[AT, 0] > 0.2 * shift
 
 
+def test_a_few_wrong_places_take_no_slopes_from_a_date():
+    made = Truth(seed=31, dates=16, interval=30.0, hidden=0.0, sloped=1).made()
+    at = int(np.abs(made.slopes).sum(axis=(1, 2)).argmax())
+    value = made.edges.value.copy()
+    sign = (made.edges.first == at) * 1.0 - (made.edges.second == at)
+    value[:, [40, 90, 91], 0] += 25.0 * sign[:, None]
+    found = adjust(made.truth.cells, dataclasses.replace(made.edges, value=value), made.years.tolist())
+    assert np.flatnonzero(found.sloped).tolist() == [at]
+    assert found.parts == ()
+
+
 @pytest.mark.parametrize(("share", "shift"), [(0.0, 0.0), (0.2, 0.3), (1.0, 3.0)])
 def test_a_whole_date_and_small_displacements_are_no_part(share, shift):
     assert solved(share, shift).parts == ()
