@@ -18,13 +18,15 @@ from ortho_pipeline.options import MatchOptions, StackOptions
 AT = 7
 
 
-def solved(share: float, shift: float, seed: int = 30, dates: int = 16, at: int = AT) -> AdjustedStack:
-    """Return a stack of which the left `share` of one date is displaced along columns."""
+def solved(
+    share: float, shift: float, seed: int = 30, dates: int = 16, at: int = AT, slope: float = 0.0
+) -> AdjustedStack:
+    """Return a stack of which the left `share` of one date is displaced along columns; all of it has a `slope`."""
     made = Truth(seed=seed, dates=dates, interval=30.0, hidden=0.0).made()
     part = made.truth.cells.place[:, 0] < 2 * share - 1
     sign = (made.edges.first == at) * 1.0 - (made.edges.second == at)
     value = made.edges.value.copy()
-    value[:, :, 0] += shift * sign[:, None] * part
+    value[:, :, 0] += sign[:, None] * (shift * part + slope * made.truth.cells.place[:, 0])
     return adjust(made.truth.cells, dataclasses.replace(made.edges, value=value), made.years.tolist())
 
 
@@ -63,6 +65,15 @@ def test_a_few_wrong_places_take_no_slopes_from_a_date():
     found = adjust(made.truth.cells, dataclasses.replace(made.edges, value=value), made.years.tolist())
     assert np.flatnonzero(found.sloped).tolist() == [at]
     assert found.parts == ()
+
+
+@pytest.mark.parametrize("shift", [3.0, 8.0])
+def test_slopes_of_a_date_are_kept_where_a_smaller_part_is_displaced(shift):
+    stack = solved(0.2, shift, slope=0.6)
+    assert np.flatnonzero(stack.sloped).tolist() == [AT]
+    assert stack.network.value[AT, 1, 0] == pytest.approx(0.6, abs=0.05)
+    (part,) = stack.parts
+    assert part.shift == pytest.approx((shift, 0.0), abs=0.15)
 
 
 @pytest.mark.parametrize(("share", "shift"), [(0.0, 0.0), (0.2, 0.3), (1.0, 3.0)])

@@ -26,8 +26,8 @@ _CHANCE = 1e-3
 _FEWEST = 3
 #: Two displacements leave this part of the squares that slopes leave. Of noise they leave 0.68, of a bend 0.23.
 _LEVELS = 0.2
-#: A smaller part of the places does not draw the shift of a date to itself, and a few wrong places are none.
-_SHARE = 0.25
+#: Slopes follow a part that is at least so much of a date. A smaller one is left out as a gross error is.
+_LARGE = 0.35
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ def parts_of(cells: Cells, left: Left, still: NDArray[np.bool_], design: Array) 
 
 
 def smaller_part(left: Left, date: int, still: NDArray[np.bool_], design: Array) -> NDArray[np.bool_]:
-    """Return at which places ``(K,)`` a date with two displacements has the rarer one; nowhere if slopes fit as well.
+    """Return at which places ``(K,)`` a date with two displacements has the rarer one; nowhere if that is a small part.
 
-    It is at a quarter of the places or more.
+    Nor anywhere if slopes fit as well.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def smaller_part(left: Left, date: int, still: NDArray[np.bool_], design: Array)
         return found
     start = np.array([value[~above].mean(axis=0), value[above].mean(axis=0)])
     levels, label = kmeans2(value, start, minit="matrix")
-    apart = np.hypot(*(levels[1] - levels[0])) > _LEAST and _SHARE <= label.mean() <= 1.0 - _SHARE
+    apart = np.hypot(*(levels[1] - levels[0])) > _LEAST and _LARGE <= label.mean() <= 1 - _LARGE
     if apart and ((value - levels[label]) ** 2).sum() < _LEVELS * ((value - fitted) ** 2).sum():
         found[known] = label == (label.mean() <= 0.5)
     return found
