@@ -190,6 +190,8 @@ def test_the_remedy_for_an_unknown_time_in_metadata_is_a_list_or_a_pattern(tmp_p
         ("x_2020-061.tif", "%Y-%j", "2020-03-01"),
         ("S2A_20240503T101201_B04.jp2", "_%Y%m%dT%H%M%S", "2024-05-03"),
         ("LC81750322024123LGN00.tif", "%Y%j", "2024-05-02"),
+        # A pattern may keep off the date of processing.
+        ("LC81750322024123LGN00_20240201.tif", "%Y%jLGN", "2024-05-02"),
         # A number with another valid date within it: the whole number is meant.
         ("x9201201011_20240503.tif", "%Y%m%d", "2024-05-03"),
         ("20240503_to_20240503.tif", "%Y%m%d", "2024-05-03"),

@@ -76,7 +76,7 @@ def by_pattern(name: str, pattern: str) -> datetime:
     valid = [(span, time) for span, time in found.items() if time is not None and time.year in _YEARS]
     # Archives put the day of acquisition before that of processing.
     alone = [time for span, time in valid if not _is_within(name, *span)]
-    if not alone and "%d" not in codes and (whole := _whole_date(name)):
+    if not alone and "%d" not in codes and (whole := _date_about(name, [span for span, _ in valid])):
         raise InputError(
             f"the pattern {pattern} takes a part of {whole} in the name {name}",
             field="stack.date_pattern",
@@ -93,10 +93,12 @@ def by_pattern(name: str, pattern: str) -> datetime:
     return times[0]
 
 
-def _whole_date(name: str) -> str | None:
-    """Return a number of a name that is a year, a month and a day, and nothing else."""
-    found = re.finditer(r"(?<!\d)(?P<Y>\d{4})(?P<m>\d{2})(?P<d>\d{2})(?!\d)", name)
-    return next((match[0] for match in found if (time := _time_in(match)) and time.year in _YEARS), None)
+def _date_about(name: str, spans: list[tuple[int, int]]) -> str | None:
+    """Return a number of a name that is a year, a month and a day, if each span touches such a number."""
+    numbers = re.finditer(r"(?<!\d)(?P<Y>\d{4})(?P<m>\d{2})(?P<d>\d{2})(?!\d)", name)
+    dates = [match for match in numbers if (time := _time_in(match)) and time.year in _YEARS]
+    about = [next((d[0] for d in dates if first < d.end() and d.start() < last), "") for first, last in spans]
+    return about[0] if about and all(about) else None
 
 
 def _time_in(match: re.Match[str]) -> datetime | None:
