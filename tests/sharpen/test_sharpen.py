@@ -370,6 +370,19 @@ def test_windows_of_samples_cross_no_block_of_the_warper(multiple: int) -> None:
     assert min(part.mean() for part in parts) > 0.2
 
 
+def test_small_orthos_with_values_at_one_side_are_sharpened(tmp_path: Path) -> None:
+    """Windows reach the right and the lower end of orthos that are less than two windows wide."""
+    bundle = Bundle(side=800)
+    pan, colours = bundle.pixels()
+    pan[:, :560] = 0
+    sharp = write(tmp_path / "pan.tif", pan[None], 0.5, nodata=0)
+    result = run("sharpen", sharp, write(tmp_path / "ms.tif", colours, 2.0, nodata=0), "-o", tmp_path / "out", "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["weights"]["values"] == pytest.approx(bundle.weights, abs=0.02)
+    assert document["quality"]["sharpened"]["ergas"] < document["quality"]["upsampled"]["ergas"]
+
+
 def test_registration_needs_a_match(tmp_path: Path) -> None:
     pan, _ = Bundle(side=256, seed=1).write(tmp_path)
     _, colours = Bundle(side=256, seed=2).write(tmp_path / "other")

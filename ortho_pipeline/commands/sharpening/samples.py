@@ -73,22 +73,25 @@ def read_samples(pan: Regridded, colours: Regridded, bands: Sequence[int], grid:
     bands : sequence of int
         Numbers of the multispectral bands.
     """
-    starts, sides = [], []
-    for length in (grid.width, grid.height):
-        side = min(max(_SIDE, _REDUCED * multiple), length)
-        side = max(side // multiple * multiple, min(multiple, length))
-        step = max(side, _SIDE)
-        starts.append(np.arange(max(1, length // step)) * step)
-        sides.append(side)
-    places = [(int(left), int(top)) for top in starts[1] for left in starts[0]]
-    most = max(1, _VALUES // (sides[0] * sides[1] * (len(bands) + 1)))
+    columns, rows = _windows(grid.width, multiple), _windows(grid.height, multiple)
+    places = [(left, top, width, height) for top, height in rows for left, width in columns]
+    most = max(1, _VALUES // (columns[0][1] * rows[0][1] * (len(bands) + 1)))
     chosen = np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))
     index, samples = np.array(bands) - 1, []
-    for left, top in (places[number] for number in chosen.tolist()):
-        (sharp, there), (pixels, valid) = (image.read(left, top, *sides) for image in (pan, colours))
+    for place in (places[number] for number in chosen.tolist()):
+        (sharp, there), (pixels, valid) = (image.read(*place) for image in (pan, colours))
         values = np.where(valid[index], pixels[index].astype(np.float32), np.float32(np.nan))
         samples.append(Sample(np.where(there[0], sharp[0].astype(np.float32), np.float32(np.nan)), values))
     return samples
+
+
+def _windows(length: int, multiple: int) -> list[tuple[int, int]]:
+    """Return starts and sides of windows along a side of a grid; the last one is what is left, if that is enough."""
+    side = min(max(_SIDE, _REDUCED * multiple), length)
+    side = max(side // multiple * multiple, min(multiple, length))
+    starts = range(0, length, max(side, _SIDE))
+    found = [(start, min(side, (length - start) // multiple * multiple)) for start in starts]
+    return [window for window in found if window[1] >= _REDUCED * multiple] or [(0, side)]
 
 
 def regress(samples: Sequence[Sample], count: int) -> Weights:
