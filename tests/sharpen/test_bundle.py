@@ -104,6 +104,28 @@ def test_both_orthos_and_the_sharpened_one_share_a_grid(tmp_path: Path, monkeypa
     np.testing.assert_allclose(sharp.mean(axis=1), wide.mean(axis=1), rtol=0.02)
 
 
+def test_heights_need_cover_the_panchromatic_image_only(tmp_path: Path) -> None:
+    """Tiles and crops of a panchromatic image come with the whole multispectral one."""
+    pan, colours = bundle_of(tmp_path)
+    whole = gdal.Open(str(pan))
+    gdal.Translate(str(tmp_path / "part.tif"), whole, srcWin=[0, 0, 160, 160])
+    ground = rpc().image_to_ground(np.array([[-8.0, -8], [168, -8], [168, 168], [-8, 168]]), rpc().h_off)
+    (west, south), (east, north) = ground[:, :2].min(axis=0), ground[:, :2].max(axis=0)
+    dem = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "dem.tif"), 40, 40, 1, gdal.GDT_Float32)
+    dem.SetGeoTransform((west, (east - west) / 40, 0, north, 0, (south - north) / 40))
+    dem.SetProjection(parse_crs("EPSG:4326").to_wkt())
+    dem.GetRasterBand(1).Fill(rpc().h_off)
+    dem = None
+    result = run(
+        "rectify", tmp_path / "part.tif", "--sharpen", colours, "--dem", tmp_path / "dem.tif", "--dem-vertical",
+        "ellipsoid", "-o", tmp_path / "out",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    orthos = [gdal.Open(str(tmp_path / "out" / f"part_ortho{end}.tif")) for end in ("", "_sharpened")]
+    sharp, made = (ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0 for ortho in orthos)
+    assert made.mean() == pytest.approx(sharp.mean(), abs=0.03)
+
+
 def test_the_ratio_is_that_of_the_pixels_of_the_ortho() -> None:
     """With another resolution an original multispectral pixel is another number of pixels wide."""
     scene, grids = coarse_scene(), {}

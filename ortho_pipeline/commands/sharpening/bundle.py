@@ -85,6 +85,9 @@ def rectify_bundle(
         creation_options=output.creation_options, memory=output.memory, threads=output.threads,
         tolerance=output.tolerance, dem_interpolation=output.dem_interpolation,
     )  # fmt: skip
+    # Only the area of the panchromatic ortho needs heights, and it has them.
+    if surface.dem is not None and surface.fill == SurfaceOptions.fill:
+        common["surface"] = dataclasses.replace(surface, fill="mask")
     wide = rectify(corrected, folder, scene=access, output=own, **common)
     done = sharpen(
         sharp.files["ortho"], wide.files["ortho"], folder, weights=weights, ratio=ratio, scene=access, output=output,
