@@ -40,6 +40,14 @@ def test_parts_are_what_they_are_whatever_the_direction_of_view(degrees: int, he
     )
 
 
+def test_parallel_lines_of_sight_show_no_heights() -> None:
+    """The panchromatic and the multispectral image of one acquisition: rounding is no parallax."""
+    residuals, matched, along = drawn(0.3, Components(4.0, 0.0, 0.08))
+    found = components(residuals, matched, 1e-9 * along)
+    assert found.height == 0.0
+    assert found.covariance(matched, along)[:, 0, 0].mean() == pytest.approx(residuals[:, 0].var(), rel=0.15)
+
+
 @pytest.mark.parametrize("extent", [60, 200], ids=["overlapping", "apart"])
 def test_what_a_fit_leaves_of_errors_that_overlapping_chips_share(extent: int) -> None:
     """Errors are means of white noise over squares about 20 places."""

@@ -114,10 +114,11 @@ class Tied:
                 lines.append(f"{pair}: {through} ({entry['reason']})")
                 continue
             column, row = entry["shift_px"]
+            heights = f"; heights differ by {metres(entry['height_m'])}" if entry["height_m"] else ""
             lines.append(
                 f"{pair}: {counted(entry['ties'], 'tie point')} ({entry['matched']} of {entry['tried']} matches "
-                f"between them succeeded); delivered models differ by column {column:+.2f} px, row {row:+.2f} px; "
-                f"heights differ by {metres(entry['height_m'])}"
+                f"between them succeeded); delivered models differ by column {column:+.2f} px, row {row:+.2f} px"
+                f"{heights}"
             )
         return "\n".join(lines)
 

@@ -22,6 +22,8 @@ from ortho_pipeline.models.base import Array
 _ROUNDS = 30
 #: Least standard deviation (px) of a match: if all residuals have one direction, nothing is left for the other.
 _LEAST = 0.01
+#: Height (m) that moves a match by less than that where both lines of sight are parallel, as in images of one bundle.
+_HIGH = 1000.0
 #: Squared residuals above this many times their expectation are gross errors, and do not count for the weights.
 _BLUNDER = 9.0
 #: One over the standard deviations of two squares and a product of independent standard normal errors.
@@ -64,8 +66,9 @@ def components(residuals: Array, matched: Array, along: Array) -> Components:
     """Estimate the factors from residuals ``(n, 2)`` of a fit to many matches.
 
     Non-negative least squares fits the parts to squares and products of the residuals, weighted by their covariance
-    under the last estimate. Gross errors are excluded.
+    under the last estimate. Gross errors are excluded. Heights have no part where hardly any height would be seen.
     """
+    along = along if float(np.median(np.linalg.norm(along, axis=1))) * _HIGH > _LEAST else np.zeros_like(along)
     sight = along[:, :, None] * along[:, None, :]
     parts = np.stack([matched, sight, np.broadcast_to(np.eye(2), matched.shape)], axis=-1)
     squares = residuals[:, :, None] * residuals[:, None, :]
@@ -123,7 +126,8 @@ def _start(residuals: Array, along: Array) -> Array:
     across = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
     far, near = (1.4826 * float(np.median(np.abs((residuals * axis).sum(axis=1)))) for axis in (unit, across))
     rest = max(near**2, 1e-6)
-    return np.array([0.0, max(far**2 - rest, 0.0) / max(float(np.median(length)) ** 2, 1e-12), rest])
+    middle = float(np.median(length))
+    return np.array([0.0, max(far**2 - rest, 0.0) / max(middle**2, 1e-12) if middle else 0.0, rest])
 
 
 def _three(matrix: Array) -> Array:
