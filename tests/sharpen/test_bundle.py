@@ -126,6 +126,23 @@ def test_heights_need_cover_the_panchromatic_image_only(tmp_path: Path) -> None:
     assert made.mean() == pytest.approx(sharp.mean(), abs=0.03)
 
 
+def test_remedies_name_options_as_they_are_typed(tmp_path: Path) -> None:
+    pan, colours = bundle_of(tmp_path)
+    random = np.random.default_rng(4)
+    places = random.uniform(20, 236, (8, 2))
+    ground = rpc().image_to_ground(places, rpc().h_off)
+    rows = ["id,col,row,x,y,h"]
+    for k, ((c, r), (x, y, h)) in enumerate(zip(places + random.normal(0, 0.1, (8, 2)), ground, strict=True)):
+        rows.append(f"{k},{c},{r},{x},{y},{h}")
+    (tmp_path / "gcps.csv").write_text("\n".join(rows))
+    result = run(
+        "rectify", pan, "--sharpen", colours, "--height", rpc().h_off, "--gcps", tmp_path / "gcps.csv", "--points-crs",
+        "EPSG:4326", "--points-vertical", "ellipsoid", "--correction", "affine", "-o", tmp_path / "out",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "Remove them with --prune." in result.output
+
+
 def test_the_ratio_is_that_of_the_pixels_of_the_ortho() -> None:
     """With another resolution an original multispectral pixel is another number of pixels wide."""
     scene, grids = coarse_scene(), {}

@@ -101,7 +101,7 @@ def rectify_bundle(
     }
     document = {**sharp.document, "sharpening": done.document}
     document |= {name: done.document[name] for name in ("warnings", "notices")}
-    return Result(files, document, f"{sharp.summary}\n\nPan-sharpened:\n{done.summary}", sharp.failure)
+    return Result(files, document, Text(sharp.summary, "\n\nPan-sharpened:\n", done.summary), sharp.failure)
 
 
 def _refuse_options(
