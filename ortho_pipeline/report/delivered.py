@@ -21,6 +21,10 @@ def accuracy_before(scene: Scene) -> Headline:
     That of an adjusted model is what its file says of the adjustment.
     """
     if scene.adjusted is not None:
+        if "from" in scene.adjusted:
+            return _untested(
+                f"The model has the correction of {scene.adjusted['from']}, whose report has the accuracy."
+            )
         try:
             return (_of_block if "gauge" in scene.adjusted else _of_scene)(scene, scene.adjusted)
         except (KeyError, TypeError, ValueError):

@@ -124,6 +124,8 @@ def test_heights_need_cover_the_panchromatic_image_only(tmp_path: Path) -> None:
     orthos = [gdal.Open(str(tmp_path / "out" / f"part_ortho{end}.tif")) for end in ("", "_sharpened")]
     sharp, made = (ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0 for ortho in orthos)
     assert made.mean() == pytest.approx(sharp.mean(), abs=0.03)
+    notes = json.loads((tmp_path / "out" / "ms_report.json").read_text())["headline"]["notes"]
+    assert notes[0].startswith("The model is used as it was delivered.")
 
 
 def test_remedies_name_options_as_they_are_typed(tmp_path: Path) -> None:
@@ -141,6 +143,8 @@ def test_remedies_name_options_as_they_are_typed(tmp_path: Path) -> None:
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "Remove them with --prune." in result.output
+    (note,) = json.loads((tmp_path / "out" / "ms_report.json").read_text())["headline"]["notes"]
+    assert note == "The model has the correction of pan.tif, whose report has the accuracy."
 
 
 def test_the_ratio_is_that_of_the_pixels_of_the_ortho() -> None:

@@ -78,7 +78,8 @@ def rectify_bundle(
     adjusted = read_model_file(sharp.files["model"]).model
     model = taken_over(adjusted, opened)
     ratio = _ratio_in(grid_of(sharp.files["ortho"]), model, opened)
-    corrected = dataclasses.replace(opened, models={model.kind: model}, adjusted={"from": Path(pan).name})
+    origin = {"from": Path(pan).name} if isinstance(adjusted, ImageCorrection) else None
+    corrected = dataclasses.replace(opened, models={model.kind: model}, adjusted=origin)
     access = SceneOptions(allow_network=scene.allow_network, roots=scene.roots)
     own = OutputOptions(
         like=sharp.files["ortho"], resampling="cubic", nodata=output.nodata, format=output.format,
