@@ -10,8 +10,8 @@ import pytest
 from osgeo import gdal, osr
 from servers import serving
 
+from ortho_pipeline.batch.stack.acquisition.times import by_pattern, time_of
 from ortho_pipeline.batch.stack.dates import dated_orthos, read_list
-from ortho_pipeline.batch.stack.times import by_pattern, time_of
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import SceneOptions
 

@@ -15,6 +15,7 @@ import numpy as np
 from ortho_pipeline.batch.executors import Crew, crew_of
 from ortho_pipeline.batch.paths import key_of_name
 from ortho_pipeline.batch.records import locked
+from ortho_pipeline.batch.stack.acquisition.times import time_of
 from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, placed_at
 from ortho_pipeline.batch.stack.document import chips_of, record_of
 from ortho_pipeline.batch.stack.items import items_of, write_items
@@ -23,7 +24,6 @@ from ortho_pipeline.batch.stack.placing import Placed, map_grid_of, pixel_of, re
 from ortho_pipeline.batch.stack.raw import Levelled, Rectifier
 from ortho_pipeline.batch.stack.recorded import LOCK, RecordedFolder, recorded_in
 from ortho_pipeline.batch.stack.result import StackResult, part_summary, summary
-from ortho_pipeline.batch.stack.times import time_of
 from ortho_pipeline.batch.stack.writing import Writer
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
 from ortho_pipeline.block.stack.edges import Cells, Edges

@@ -17,8 +17,8 @@ from typing import Any
 from ortho_pipeline.batch.freshness import DIGESTS, far_states, state_of
 from ortho_pipeline.batch.paths import PipelinePaths, Place, key_of_name
 from ortho_pipeline.batch.records import FileState
-from ortho_pipeline.batch.stack.conditions import Conditions, conditions_of
-from ortho_pipeline.batch.stack.times import by_pattern, time_of
+from ortho_pipeline.batch.stack.acquisition.conditions import Conditions, conditions_of
+from ortho_pipeline.batch.stack.acquisition.times import by_pattern, time_of
 from ortho_pipeline.commands.heights.opening import GIVE_HEIGHTS, dem_files, has_surface
 from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
 from ortho_pipeline.commands.orthos.verifying import RASTERS
