@@ -336,7 +336,7 @@ def test_the_map_of_the_house_is_true() -> None:
 
 #: Whole command lines, of this program and of others, which are typed as they are.
 COMMAND_LINE = re.compile(
-    r"\b(ortho (adjust|align|doctor|fit|measure|rectify|run|sensors)|pyproj sync|projsync|gdal_calc\.py|"
+    r"\b(ortho (adjust|align|doctor|fit|measure|rectify|run|sensors|sharpen)|pyproj sync|projsync|gdal_calc\.py|"
     r"mapproject|parallel_stereo|point2dem|dem_mosaic) "
 )
 

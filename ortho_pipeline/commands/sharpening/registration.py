@@ -87,10 +87,13 @@ def displaced(
     """
     if agreement.rmse <= LIMIT:
         return None
-    moved, more = typed(Path("aligned", f"{Path(colours).stem}_aligned.tif")), f" --ratio {ratio}" if ratio else ""
+    moved = typed(Path("aligned", f"{Path(colours).stem}_aligned.tif"))
+    again = f"ortho sharpen {typed(pan)} {moved} -o sharpened"
+    if ratio:
+        again = f"ortho sharpen {typed(pan)} {moved} --ratio {ratio} -o sharpened"
     text = Text(
         f"the multispectral ortho is displaced by {agreement.rmse:.2f} panchromatic px (limit {LIMIT} px), so colours "
         f"are next to their objects. Align it: `ortho align {typed(colours)} --reference {typed(pan)} -o aligned`. "
-        f"Then sharpen again: `ortho sharpen {typed(pan)} {moved}{more} -o sharpened`"
+        f"Then sharpen again: `{again}`"
     )
     return Notice("sharpen-displaced", text, rmse_px=agreement.rmse, limit_px=LIMIT)
