@@ -110,7 +110,9 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
     if sensor_width is not None:
         if focal is None:
             raise tags.error("the tags have no focal length", "FocalLength", "give camera=FILE (docs/formats/frame.md)")
-        return PhotoCamera(_plain(width, height, focal / sensor_width * width), "sensor width of the options")
+        # A sensor is wider than high, also in photos that are stored as portraits.
+        pixels = focal / sensor_width * max(width, height)
+        return PhotoCamera(_plain(width, height, pixels), "sensor width of the options")
     if (zoom := tags.positive("DigitalZoomRatio") or 1.0) > _ZOOMED:
         raise tags.error(
             f"this photo was zoomed digitally by {zoom:g}: it shows a part of the sensor",

@@ -588,6 +588,12 @@ def test_photos_in_formats_that_are_not_read_are_named_unless_they_have_a_copy(t
     assert notice.fields["images"] == ["c.HEIC"]
 
 
+def test_the_width_of_a_sensor_is_its_longer_side_also_in_portraits(tmp_path):
+    size = {"PixelXDimension": "400", "PixelYDimension": "600"}
+    for path in (photo(tmp_path / "a.tif"), photo(tmp_path / "b.tif", {**EXIF, **size}, size=(400, 600))):
+        assert opened(path, sensor_width="13.2").facts["focal_length_px"] == pytest.approx(400, abs=1e-3)
+
+
 def test_photos_that_do_not_overlap_are_an_error(tmp_path):
     far = {**EXIF, "GPSLongitude": "(33) (45) (0)"}
     files = [str(photo(tmp_path / "a.tif")), str(photo(tmp_path / "b.tif", far, without(DJI, "Gps")))]
