@@ -88,12 +88,12 @@ def displaced(
     if agreement.rmse <= LIMIT:
         return None
     moved = typed(Path("aligned", f"{Path(colours).stem}_aligned.tif"))
-    again = f"ortho sharpen {typed(pan)} {moved} -o sharpened"
+    again = f"`ortho sharpen {typed(pan)} {moved} -o sharpened`"
     if ratio:
-        again = f"ortho sharpen {typed(pan)} {moved} --ratio {ratio} -o sharpened"
+        again = f"`ortho sharpen {typed(pan)} {moved} --ratio {ratio} -o sharpened`"
     text = Text(
         f"the multispectral ortho is displaced by {agreement.rmse:.2f} panchromatic px (limit {LIMIT} px), so colours "
         f"are next to their objects. Align it: `ortho align {typed(colours)} --reference {typed(pan)} -o aligned`. "
-        f"Then sharpen again: `{again}`"
+        f"Then sharpen again: {again}"
     )
     return Notice("sharpen-displaced", text, rmse_px=agreement.rmse, limit_px=LIMIT)
