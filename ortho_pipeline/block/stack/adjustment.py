@@ -14,7 +14,7 @@ from ortho_pipeline.block.stack.components import ErrorComponents, components_of
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.moving import Left, Motion, left_of, motion_of
 from ortho_pipeline.block.stack.network import Closures, Network, accepted_edges, solve
-from ortho_pipeline.block.stack.parts import DatePart, parts_of, smaller_part
+from ortho_pipeline.block.stack.parts import DatePart, has_two, parts_of
 from ortho_pipeline.block.stack.steps import DateStep, steps_of
 from ortho_pipeline.block.stack.trends import Trends, design_of, trends_of
 from ortho_pipeline.models.base import Array
@@ -100,9 +100,9 @@ def adjust(
             break
         stable = ~motion.moving
     sloped = _sloped(edges, three, place, stable, dates) if affine else none
-    left = solved.left(times)
-    for date in np.flatnonzero(sloped):
-        sloped[date] = not smaller_part(left, int(date), stable, three).any()
+    if sloped.any():
+        left = solved.left(times)
+        sloped &= [not (slopes and has_two(left, date, stable, three)) for date, slopes in enumerate(sloped)]
     for _ in range(_ROUNDS):
         solved = _Solved.of(edges, three if sloped.any() else one, place, stable, sloped)
         motion = motion_of(solved.left(times), times)

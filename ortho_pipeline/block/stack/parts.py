@@ -41,14 +41,14 @@ class DatePart:
 
 
 def parts_of(cells: Cells, left: Left, still: NDArray[np.bool_], design: Array) -> list[DatePart]:
-    """Return the displaced parts of dates, where ground is `still` ``(K,)``; `design` as of `smaller_part`."""
+    """Return the displaced parts of dates, where ground is `still` ``(K,)``; `design` as of `has_two`."""
     found, limit = [], chi2.isf(_CHANCE / max(still.sum() * len(left.scale), 1), 2)
     for date in range(len(left.scale)):
         known, shift, of_edges = _displacement(left, date, still)
         variance = (left.scale[date] * left.shared + of_edges) * left.noisier
         far = known & (np.hypot(*shift.T) > _LEAST) & ((shift**2).sum(axis=1) > limit * variance)
         # A large part makes the date noisy, so that none of its cells is beyond the limit.
-        half = smaller_part(left, date, still, design)
+        half = _smaller_part(known, shift, design)
         far |= half
         area = ndimage.label(far.reshape(cells.shape[::-1]), NEXT)[0].ravel()
         part = far & (np.bincount(area)[area] >= AREA)
@@ -59,19 +59,27 @@ def parts_of(cells: Cells, left: Left, still: NDArray[np.bool_], design: Array) 
     return found
 
 
-def smaller_part(left: Left, date: int, still: NDArray[np.bool_], design: Array) -> NDArray[np.bool_]:
-    """Return at which places ``(K,)`` a date with two displacements has the rarer one; nowhere if that is a small part.
-
-    Nor anywhere if slopes fit as well.
+def has_two(left: Left, date: int, still: NDArray[np.bool_], design: Array) -> bool:
+    """Tell whether a date has two displacements rather than slopes.
 
     Parameters
     ----------
+    left : Left
+        What a network of shifts leaves.
     still : (K,) of bool
     design : (K, 3)
         Terms of an affine correction.
     """
     known, shift, _ = _displacement(left, date, still)
-    value, found = shift[known], np.zeros(len(still), dtype=bool)
+    return bool(_smaller_part(known, shift, design).any())
+
+
+def _smaller_part(known: NDArray[np.bool_], shift: Array, design: Array) -> NDArray[np.bool_]:
+    """Return at which places ``(K,)`` a date with two displacements has the rarer one; nowhere if that is a small part.
+
+    Nor anywhere if slopes fit as well.
+    """
+    value, found = shift[known], np.zeros(len(known), dtype=bool)
     if len(value) < 2 * AREA:
         return found
     fitted = design[known] @ np.linalg.lstsq(design[known], value, rcond=None)[0]

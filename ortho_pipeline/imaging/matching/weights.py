@@ -127,7 +127,7 @@ def _start(residuals: Array, along: Array) -> Array:
     far, near = (1.4826 * float(np.median(np.abs((residuals * axis).sum(axis=1)))) for axis in (unit, across))
     rest = max(near**2, 1e-6)
     middle = float(np.median(length))
-    return np.array([0.0, max(far**2 - rest, 0.0) / max(middle**2, 1e-12) if middle else 0.0, rest])
+    return np.array([0.0, max(far**2 - rest, 0.0) / middle**2 if middle else 0.0, rest])
 
 
 def _three(matrix: Array) -> Array:

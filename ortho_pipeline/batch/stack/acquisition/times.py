@@ -73,7 +73,7 @@ def by_pattern(name: str, pattern: str) -> datetime:
             remedy="change the pattern, or give a CSV file with the columns file and date",
         )
     found = {match.span("whole"): _time_in(match) for match in matches}
-    valid = [(span, time) for span, time in found.items() if time is not None and time.year in _YEARS]
+    valid = [(span, time) for span, time in found.items() if time is not None]
     # Archives put the day of acquisition before that of processing.
     alone = [time for span, time in valid if not _is_within(name, *span)]
     if not alone and "%d" not in codes and (whole := _date_about(name, [span for span, _ in valid])):
@@ -96,20 +96,20 @@ def by_pattern(name: str, pattern: str) -> datetime:
 def _date_about(name: str, spans: list[tuple[int, int]]) -> str | None:
     """Return a number of a name that is a year, a month and a day, if each span touches such a number."""
     numbers = re.finditer(r"(?<!\d)(?P<Y>\d{4})(?P<m>\d{2})(?P<d>\d{2})(?!\d)", name)
-    dates = [match for match in numbers if (time := _time_in(match)) and time.year in _YEARS]
+    dates = [match for match in numbers if _time_in(match) is not None]
     about = [next((d[0] for d in dates if first < d.end() and d.start() < last), "") for first, last in spans]
     return about[0] if about and all(about) else None
 
 
 def _time_in(match: re.Match[str]) -> datetime | None:
-    """Return the time at a place of a pattern; None if there is no such time."""
+    """Return the time at a place of a pattern; None if there is no such time, or in no year of images."""
     numbers = {key: text for key, text in match.groupdict().items() if key != "whole"}
     try:
         time = datetime.strptime("".join(numbers.values()), "".join(f"%{key}" for key in numbers)).replace(tzinfo=UTC)
     except ValueError:
         return None
     # strptime takes day 366 of any year.
-    return time if time.year == int(numbers["Y"]) else None
+    return time if time.year == int(numbers["Y"]) and time.year in _YEARS else None
 
 
 def _is_within(name: str, first: int, last: int) -> bool:
