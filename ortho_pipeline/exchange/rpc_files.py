@@ -173,7 +173,7 @@ def _text_of(path: str | PathLike[str]) -> str:
     data = files.read_bounded(path, MAX_SIZE)
     if len(data) > MAX_SIZE:
         raise InputError("this file is larger than 5 MB, so it is not an RPC file", file=path)
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+    if data.startswith(files.UTF_16):
         raise InputError("this file is UTF-16 text", file=path, remedy="save it as UTF-8")
     if b"\0" in data:
         raise InputError("this is a binary file, not RPC text", file=path)

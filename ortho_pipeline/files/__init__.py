@@ -6,7 +6,7 @@ Imports nothing above `errors`.
 from __future__ import annotations
 
 from ortho_pipeline.files.locks import Lock, open_itself
-from ortho_pipeline.files.reading import Checksums, decoded, parse_json, read_bounded, read_json, sha256, states
+from ortho_pipeline.files.reading import UTF_16, Checksums, decoded, parse_json, read_bounded, read_json, sha256, states
 from ortho_pipeline.files.whole import (
     Outputs,
     allowed,
@@ -25,6 +25,7 @@ from ortho_pipeline.files.whole import (
 )
 
 __all__ = [
+    "UTF_16",
     "Checksums",
     "Lock",
     "Outputs",

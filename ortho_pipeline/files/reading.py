@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import hashlib
 import json
@@ -17,6 +18,8 @@ from typing import Any
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import VsiPath, check_path
 
+#: Marks at the beginning of text in UTF-16.
+UTF_16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 #: Bytes that are read at once for a checksum.
 _CHUNK = 1 << 20
 #: The escape of half a character.
@@ -84,7 +87,7 @@ def decoded(data: bytes) -> str:
     'Büyüksalih'
     """
     try:
-        return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+        return data.decode("utf-16" if data.startswith(UTF_16) else "utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
 

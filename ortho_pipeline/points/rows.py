@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files import UTF_16, read_bounded
 from ortho_pipeline.options import PIXEL_ORIGINS
 
 Array = NDArray[np.float64]
@@ -234,7 +234,7 @@ def load_text(path: str | os.PathLike[str]) -> str:
             remedy="export the cell array of the GCP tool as text, and name its columns Name, Pixel, Line, Easting, "
             "Northing, Elev",
         )
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+    if data.startswith(UTF_16):
         raise InputError("this file is UTF-16", file=path, remedy="save it as UTF-8")
     if b"\0" in data:
         line = data[: data.index(b"\0")].count(b"\n") + 1

@@ -45,6 +45,11 @@ _GEOID_SIDE = 33
 _LARGEST_SIGMA = 10_000.0
 
 
+def gaps_masked(options: SurfaceOptions) -> SurfaceOptions:
+    """Return options with which pixels without heights are empty, unless the user chose how to fill them."""
+    return replace(options, fill="mask") if options.dem is not None and options.fill == SurfaceOptions.fill else options
+
+
 def open_surface(
     options: SurfaceOptions,
     scene: SceneOptions = SceneOptions(),

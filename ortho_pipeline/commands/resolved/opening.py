@@ -8,7 +8,7 @@ import os
 
 from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.points import read_control
-from ortho_pipeline.commands.heights.opening import has_surface, open_surface
+from ortho_pipeline.commands.heights.opening import gaps_masked, has_surface, open_surface
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
@@ -50,10 +50,7 @@ def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
 
 def _heights_of(request: Request) -> SurfaceOptions:
     """Return the options of heights. A true ortho has empty pixels anyway: so it has where the DSM has gaps."""
-    options = request.surface
-    if request.output.visibility == "nodata" and options.fill == SurfaceOptions.fill and options.dem is not None:
-        return dataclasses.replace(options, fill="mask")
-    return options
+    return gaps_masked(request.surface) if request.output.visibility == "nodata" else request.surface
 
 
 def on_surface(scene: Scene, surface: Surface | None) -> Scene:

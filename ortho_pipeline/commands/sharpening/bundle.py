@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.heights.opening import gaps_masked
 from ortho_pipeline.commands.rectification import rectify
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.sharpening.sharpen import require_one, require_several, sharpen
@@ -87,8 +88,7 @@ def rectify_bundle(
         tolerance=output.tolerance, dem_interpolation=output.dem_interpolation,
     )  # fmt: skip
     # Only the area of the panchromatic ortho needs heights, and it has them.
-    if surface.dem is not None and surface.fill == SurfaceOptions.fill:
-        common["surface"] = dataclasses.replace(surface, fill="mask")
+    common["surface"] = gaps_masked(surface)
     wide = rectify(corrected, folder, scene=access, output=own, **common)
     done = sharpen(
         sharp.files["ortho"], wide.files["ortho"], folder, weights=weights, ratio=ratio, scene=access, output=output,
