@@ -183,3 +183,15 @@ def test_wrong_options_are_refused_before_any_work(tmp_path: Path) -> None:
         assert f"{option}: the pixels of this image are" in result.output
         assert "so there is no detail to add" in result.output
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_a_bundle_suggests_to_sharpen(tmp_path: Path) -> None:
+    pan, colours = bundle_of(tmp_path)
+    steps = json.loads(run("info", tmp_path, "--json").stdout)["next"]
+    assert steps[-1].split()[:5] == ["ortho", "rectify", str(pan), "--sharpen", str(colours)]
+    # Two images of neighbouring places are no bundle, nor are two of several bands.
+    dataset = gdal.Open(str(colours), gdal.GA_Update)
+    far = replace(rpc(), lon_off=rpc().lon_off + 2 * rpc().lon_scale).scaled(4.0)
+    dataset.SetMetadata(rpc_metadata(far), "RPC")
+    dataset = None
+    assert "--sharpen" not in " ".join(json.loads(run("info", tmp_path, "--json").stdout)["next"])

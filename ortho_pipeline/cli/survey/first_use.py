@@ -184,6 +184,9 @@ def next_steps(seen: FolderSurvey) -> list[str]:
 
     if not scenes:
         return _without_models(seen, images) if images else _without_images(seen)
+    # Points of a block are for both images; a bundle has those of its panchromatic image.
+    bundle = None if seen.beside(scenes[0], "block points") else seen.bundle
+    scenes = scenes if bundle is None else [bundle[0]]
     dems = seen.beside(scenes[0], "dem")
     notes, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
     if not dems:
@@ -201,7 +204,9 @@ def next_steps(seen: FolderSurvey) -> list[str]:
     more, given = _control_of(seen, scenes[0], block)
     notes, words = [*notes, *more], [*words, *given]
     if len(scenes) == 1:
-        return [*notes, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
+        colours = ["--sharpen", at(bundle[1])] if bundle else []
+        what = "Make both orthos, and pan-sharpen the multispectral one:" if bundle else "Make the ortho:"
+        return [*notes, what, "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *colours, *words, "-o", "out"])]
     frames = [file for file in seen.found if file.kind == "scene" and "frame" in file.models]
     if block or (len(frames) == len(scenes) and not points):
         # Photos at the rim show more than a surface model that was made of them.

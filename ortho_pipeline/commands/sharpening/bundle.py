@@ -20,7 +20,7 @@ from ortho_pipeline.commands.rectification import rectify
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.sharpening.sharpen import require_one, require_several, sharpen
 from ortho_pipeline.display.numbers import significant
-from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.errors import InputError, OrthoError, completed
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.exchange.model_file import read_model_file
@@ -103,6 +103,27 @@ def rectify_bundle(
     document = {**sharp.document, "sharpening": done.document}
     document |= {name: done.document[name] for name in ("warnings", "notices")}
     return Result(files, document, Text(sharp.summary, "\n\nPan-sharpened:\n", done.summary), sharp.failure)
+
+
+def find_bundle(
+    images: tuple[str | os.PathLike[str], str | os.PathLike[str]], options: SceneOptions
+) -> tuple[str | os.PathLike[str], str | os.PathLike[str]] | None:
+    """Return the panchromatic image first, then the multispectral one; None if two images are no bundle.
+
+    They are one if the multispectral image is coarser, and its middle is in the panchromatic one.
+    """
+    try:
+        counts = [len(colour_bands(RasterSource(path, **options.access))) for path in images]
+        pan, colours = images if counts[0] == 1 else images[::-1]
+        if min(counts) != 1 or max(counts) < 2 or Path(pan).stem == Path(colours).stem:
+            return None
+        sharp, wide = inputs.open_scene(pan, options), inputs.open_scene(colours, options)
+        taken_over(sharp.model, wide)
+        middle = wide.model.image_to_ground(np.array([[wide.width / 2, wide.height / 2]]), wide.model.reference_height)
+        image = sharp.model.ground_to_image(ground_transform(wide.model.crs, sharp.model.crs)(middle))
+    except OrthoError:
+        return None
+    return (pan, colours) if ((image >= 0) & (image <= [sharp.width, sharp.height])).all() else None
 
 
 def _refuse_options(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +16,7 @@ from ortho_pipeline import host
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
+from ortho_pipeline.commands.sharpening.bundle import find_bundle
 from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, OrthoError
@@ -84,10 +85,14 @@ class SurveyedFile:
 
 @dataclass(frozen=True)
 class FolderSurvey:
-    """The contents of a folder."""
+    """The contents of a folder.
+
+    `bundle` has its panchromatic and its multispectral scene, if these two are all.
+    """
 
     folder: Path
     found: tuple[SurveyedFile, ...]
+    bundle: tuple[str, str] | None = None
 
     def of(self, kind: Kind) -> list[str]:
         """Return the paths of a kind, from the folder."""
@@ -147,7 +152,15 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
             remedy="give the folder of one delivery, or write the pipeline file yourself (docs/run.md)",
         )
     files = [file for path in names if (file := _looked_at(path, place, options)) is not None]
-    return FolderSurvey(place, tuple(_without_parts(files)))
+    seen = FolderSurvey(place, tuple(_without_parts(files)))
+    return replace(seen, bundle=_bundle(seen, options))
+
+
+def _bundle(seen: FolderSurvey, options: SceneOptions) -> tuple[str, str] | None:
+    if len(scenes := seen.of("scene")) != 2:
+        return None
+    found = find_bundle((seen.folder / scenes[0], seen.folder / scenes[1]), options)
+    return None if found is None else (os.path.relpath(found[0], seen.folder), os.path.relpath(found[1], seen.folder))
 
 
 def images_of(
