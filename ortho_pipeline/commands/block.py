@@ -24,9 +24,10 @@ from ortho_pipeline.commands.block_images import labels_of, refuse_copies, scene
 from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
 from ortho_pipeline.commands.block_results.models import adjusted_models, exported_models
 from ortho_pipeline.commands.block_results.orthos import (
-    make_orthos,
+    OrthoPlan,
     mosaic_of_orthos,
     ortho_files,
+    orthos_made,
     planned,
     with_mosaic,
 )
@@ -155,7 +156,7 @@ def adjust(
     adjusted = adjusted_models(fit, starts, gathered.heights)
     exported, complaints = exported_models(adjusted, files)
     plan = planned(starts, fit, adjusted, files, of_orthos, gathered.heights, (scenes[0], surface, orthos))
-    complaints += [] if plan is None else plan.notices
+    complaints += plan.notices if isinstance(plan, OrthoPlan) else []
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     report = block_report.build_report(
         fit=fit,
@@ -170,13 +171,12 @@ def adjust(
         _write(files, report, fit, starts, adjusted, exported, record)
         told = AdjustedBlock(fit, starts, adjusted, gathered.heights, scenes[0]).export(programs, Path(folder), files)
         failure = attempted(lambda: _write_report(files, report, _pictures(starts, scenes[0])), files, "report", "html")
-        if plan is not None:
-            failure = next(filter(None, (failure, *make_orthos(plan, command, progress).values())), None)
-            files |= {f"{label} {kind}": path for label, own in plan.files.items() for kind, path in own.items()}
+        made, lost = orthos_made(plan, of_orthos | of_mosaic, command, progress)
+        files |= {f"{label} {kind}": path for label, own in made.items() for kind, path in own.items()}
         begun.require_unchanged()
     text = Text.joined("\n", [block_report.summary_text(report), *gathered.text, *told])
-    result = Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
-    return result if mosaic is None or plan is None else with_mosaic(result, plan.files, of_mosaic, mosaic)
+    result = Result(files, {"report": report.to_json(), **gathered.document}, text, failure or lost)
+    return result if mosaic is None or not made else with_mosaic(result, made, of_mosaic, mosaic)
 
 
 @with_items

@@ -81,6 +81,28 @@ def test_the_cartosat_pair_on_one_grid(sample: Path, tmp_path: Path) -> None:
     assert document["mosaic"]["seams"]
 
 
+def test_a_dem_that_ends_within_an_image_does_not_cost_the_block(sample: Path, tmp_path: Path) -> None:
+    """The error comes after the adjustment. Models and report are written; orthos of an earlier adjustment go."""
+    folder, out = sample / "cartosat", tmp_path / "block"
+    images = folder / "BANDA.tif", folder / "BANDF.tif"
+    words = "adjust", *images, "--points", folder / "points.csv", "--orthos", "--mosaic", "-o", out
+    run(*words, "--dem", folder / "dem.tif")
+    assert (out / "mosaic.tif").exists()
+    (out / "BANDA_model.json").unlink()
+    whole = gdal.Open(str(folder / "dem.tif"))
+    dem = tmp_path / "part.tif"
+    gdal.Translate(str(dem), whole, srcWin=[0, 0, whole.RasterXSize * 2 // 3, whole.RasterYSize])
+    done = CliRunner().invoke(cli, [str(word) for word in (*words, "--dem", dem)])
+    assert done.exit_code == 3
+    assert "the adjusted models and the report are complete" in done.stderr
+    assert "--dem-fill mask" in done.stderr
+    assert {"BANDA_model.json", "BANDF_model.json", "block_report.html"} <= {path.name for path in out.iterdir()}
+    assert not {"mosaic.tif", "BANDA_ortho.tif", "BANDA_report.json"} & {path.name for path in out.iterdir()}
+    # The remedy.
+    more = "--dem", dem, "--dem-fill", "mask", "-o", tmp_path / "again"
+    run("rectify", folder / "BANDA.tif", "--model", out / "BANDA_model.json", *more)
+
+
 def photos_and_dem(folder: Path, **east: float) -> dict[str, Scene]:
     """Write a DEM ``dem.tif`` of one height; return photos 100 m above it, some of which are not over it."""
     write_dem(folder / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")

@@ -140,13 +140,23 @@ def planned(
     of_orthos: Mapping[str, dict[str, Path]],
     heights: Surface | None,
     asked: tuple[SceneOptions, SurfaceOptions, OutputOptions | None],
-) -> OrthoPlan | None:
-    """Return the plan of the orthos of a block; None where none are asked for."""
+) -> OrthoPlan | ReportError | None:
+    """Return the plan of the orthos of a block; None where none are asked for.
+
+    Where the DEM does not cover the images: the error. It must not cost the block, which can have taken hours.
+    """
     options, surface, output = asked
     if output is None:
         return None
     scenes = adjusted_scenes(starts, fit, models, files)
-    return OrthoPlan.of(scenes, of_orthos, fit, heights, (options, surface, output))
+    try:
+        return OrthoPlan.of(scenes, of_orthos, fit, heights, (options, surface, output))
+    except CoverageError as error:
+        why = Text(
+            "the orthos could not be made (", error.message, "); the adjusted models and the report are complete"
+        )
+        again = "rectify each image with its adjusted model, which needs no new matches"
+        return ReportError(why, file=error.file, field=error.field, remedy=Text(error.remedy or "", f". Then {again}"))
 
 
 def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOptions) -> OutputOptions:
@@ -189,6 +199,22 @@ def _named(outside: Mapping[str, CoverageError]) -> CoverageError:
         field=error.field,
         remedy=Text(error.remedy or "", f"; or leave {'these images' if others else 'this image'} out"),
     )
+
+
+def orthos_made(
+    plan: OrthoPlan | ReportError | None,
+    expected: Mapping[str, Mapping[str, Path]],
+    command: str | None,
+    progress: Progress | None,
+) -> tuple[Mapping[str, Mapping[str, Path]], ReportError | None]:
+    """Make the orthos of a plan; return their outputs by image, and the first error.
+
+    Where there are none, the `expected` outputs of an earlier adjustment go.
+    """
+    if isinstance(plan, OrthoPlan):
+        return plan.files, next(iter(make_orthos(plan, command, progress).values()), None)
+    retire(path for files in expected.values() for path in files.values())
+    return {}, plan
 
 
 @cache_restored()
