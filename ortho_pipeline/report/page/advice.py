@@ -82,8 +82,10 @@ _LOOK: dict[str, str] = {
     "ortho-part-displaced": "Find out which of the two is wrong there. If clouds or glaciers moved, leave them out "
     "with a mask.",
     "ortho-tested-in-part": "Add references that show the rest, or do not use the ortho there.",
-    "left-out": "Check the point in the image and at its source. Measure it again or delete it.",
-    "more-left-out": "Inspect the points and the model: they do not belong together.",
+    "left-out": "Check the point in the image and at its source. Measure it again or delete it. For a few automatic "
+    "tie points there is nothing to do.",
+    "more-left-out": "If these are many of the points, points and model do not belong together. A few percent of "
+    "automatic tie points are usually wrong.",
     "contradicting-point": "Measure the point again. Delete it only if it is proven wrong.",
     "no-projection": "Add the heights of the points, and check their CRS.",
     "takes-no-part": "Measure these points in one more image.",
