@@ -19,6 +19,7 @@ from ortho_pipeline.commands.sharpening.bundle import _ratio_in, taken_over
 from ortho_pipeline.commands.sharpening.registration import Agreement
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.exchange.rpc_files import write_rpc_txt
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
@@ -167,7 +168,7 @@ def test_wrong_options_are_refused_before_any_work(tmp_path: Path) -> None:
     out = "--height", 800, "-o", tmp_path / "out"
     for words, message in (
         (("--sharpen", pan), "the same name"),
-        (("--sharpen", colours, "--rpc", "tag"), "opens one image"),
+        (("--sharpen", colours, "--rpc", tmp_path / "pan_RPC.TXT"), "opens one image"),
         (("--sharpen", colours, "--fit-model", "affine3d", "--gcps", tmp_path / "p.csv"), "in the image only"),
         (("--weights", "1,2"), "also give --sharpen"),
         (("--sharpen", colours, "--weights", "a,b"), "not a list of numbers"),
@@ -183,6 +184,18 @@ def test_wrong_options_are_refused_before_any_work(tmp_path: Path) -> None:
         assert f"{option}: the pixels of this image are" in result.output
         assert "so there is no detail to add" in result.output
     assert not (tmp_path / "out").exists()
+
+
+def test_the_remedy_for_two_rpcs_of_an_image_works_for_a_bundle(tmp_path: Path) -> None:
+    pan, colours = bundle_of(tmp_path)
+    for name, scale in (("pan", 1.0), ("ms", 4.0)):
+        write_rpc_txt(rpc().scaled(scale).shifted(50.0, 0.0), tmp_path / f"{name}_RPC.TXT")
+    words = "rectify", pan, "--sharpen", colours, "--height", rpc().h_off, "-o", tmp_path / "out"
+    refused = run(*words)
+    assert refused.exit_code == 2
+    assert "choose one: --rpc tag" in refused.output
+    done = run(*words, "--rpc", "tag")
+    assert done.exit_code == 0, done.output
 
 
 def test_a_folder_with_a_bundle_suggests_to_sharpen(tmp_path: Path) -> None:

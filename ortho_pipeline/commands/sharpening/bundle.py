@@ -137,7 +137,8 @@ def _refuse_options(
             remedy="make each ortho in its own folder, and sharpen the orthos",
         )
     for name in _OF_ONE:
-        if getattr(scene, name) is not None:
+        # "tag" and "sidecar" choose the RPC of any image.
+        if getattr(scene, name) not in (None, "tag", "sidecar"):
             raise InputError(
                 Text(Setting(f"scene.{name}"), " opens one image, and these are two"),
                 field=f"scene.{name}",
