@@ -173,9 +173,7 @@ def _median_subset(solution: Solution, priors: int) -> np.ndarray:
     """Return a clean subset ``(n,)`` by least median of squares on the linearised problem."""
     jacobian, residuals = (solution.errors.whitened(values) for values in (solution.jacobian, solution.residuals))
     count, params = len(jacobian), jacobian.shape[2]
-    size = max(1, solution.model.minimum_points, math.ceil((params - priors) / 2))
-    if priors:
-        size = max(1, math.ceil((params - priors) / 2))
+    size = max(1, math.ceil((params - priors) / 2), 0 if priors else solution.model.minimum_points)
     subsets = np.array(_minimal_subsets(count, size))
     # Linear in a step from the common solution; a minimal subset with 2 * size > params is solved by least squares.
     inverses = np.linalg.pinv(jacobian[subsets].reshape(len(subsets), 2 * size, params))

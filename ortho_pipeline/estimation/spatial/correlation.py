@@ -357,12 +357,10 @@ def _function(distance: Array, halves: Array) -> CovarianceFunction | None:
     at, seen = (np.array([values[part].mean() for part in parts]) for values in (distance, halves))
     pairs = np.array([len(part) for part in parts], dtype=np.float64)
     weight = pairs / np.maximum(seen, 1e-12 * seen.max()) ** 2
-    best = None
     for _ in range(4):
-        best = _best_range(at, seen, weight, reach)
-        model = best[0] + best[1] * -np.expm1(-at / best[2])
+        noise, shared, length = _best_range(at, seen, weight, reach)
+        model = noise + shared * -np.expm1(-at / length)
         weight = pairs / np.maximum(model, 1e-9 * seen.max()) ** 2
-    noise, shared, length = best or (0.0, 0.0, 0.0)
     if shared <= 0:
         return None
     return CovarianceFunction(noise=math.sqrt(noise), systematic=math.sqrt(shared), range_m=length)
