@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -28,9 +29,7 @@ def side_by_side(first: RPC, second: RPC) -> Pieces:
 
 def test_pieces_on_both_sides_of_the_antimeridian_are_one_image() -> None:
     pieces = side_by_side(piece(179.995), piece(-179.995))
-    centre, half = pieces.domain
-    assert centre[0] == pytest.approx(180.0)
-    assert half[0] == pytest.approx(0.01)
+    np.testing.assert_allclose(pieces.domain, [[180.0, 10.0, 500.0], [0.01, 0.005, 500.0]], rtol=0, atol=1e-9)
     image = np.random.default_rng(0).uniform(0, 1, (40, 2)) * (2000, 1000)
     ground = pieces.image_to_ground(image, 500.0)
     assert np.abs(pieces.ground_to_image(ground) - image).max() < 1e-6
@@ -60,6 +59,16 @@ def test_the_scale_of_a_model_is_that_of_its_pixels_in_metres(side: float) -> No
     )  # fmt: skip
     assert relative_scale(fine, coarse, (1000, 1000)) == pytest.approx(2.0, rel=1e-6)
     assert relative_scale(coarse, fine, (1000, 1000)) == pytest.approx(0.5, rel=1e-6)
+
+
+def test_the_scale_of_a_model_is_that_in_the_middle_of_its_image() -> None:
+    """Columns grow as x + 0.2 x^2, and rows as y + 0.2 y^2: the slope at a value c of these is sqrt(1 + 0.8 c)."""
+    column, row = np.zeros(20), np.zeros(20)
+    column[[1, 7]], row[[2, 8]] = (1.0, 0.2), (-1.0, -0.2)
+    bent = dataclasses.replace(piece(0.0), col_num=column, row_num=row)
+    # Column 300 and row 450 are 0.4 and 0.1 of the half-size to the left and above.
+    stretched = math.sqrt(1 + 0.8 * -0.4) * math.sqrt(1 + 0.8 * 0.1)
+    assert relative_scale(piece(0.0), bent, (600, 900)) == pytest.approx(1 / math.sqrt(stretched), rel=1e-9)
 
 
 def test_a_point_belongs_to_the_piece_that_it_is_in_or_nearest_to() -> None:
