@@ -47,8 +47,9 @@ def lit(model: Pushbroom, **light: bool) -> Pushbroom:
 
 
 def points(model: Pushbroom, seed: int = 0) -> tuple[Array, Array]:
+    """Return image points and their ground, from sea level to the highest summits."""
     image = np.random.default_rng(seed).uniform(0.0, 1.0, (30, 2)) * SIZE
-    return image, model.image_to_ground(image, np.tile([0.0, 1500.0, 5000.0], 10))
+    return image, model.image_to_ground(image, np.tile([0.0, 1500.0, 8800.0], 10))
 
 
 def test_aberration_is_that_of_light_that_was_under_way() -> None:
