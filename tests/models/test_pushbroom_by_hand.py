@@ -159,6 +159,13 @@ def test_what_a_camera_states_of_itself() -> None:
         _ = replace(model, mounting=MOUNTING * [1.0, -1.0, -1.0]).domain
 
 
+def test_a_camera_that_looks_up_sees_no_ground() -> None:
+    """The straight lines of its rays meet the ground behind it."""
+    ground = north().image_to_ground([[500.0, 300.0], [100.0, 500.0]], 0.0)
+    assert np.isfinite(ground).all()
+    assert np.isnan(north(mounting=MOUNTING * [1.0, -1.0, -1.0]).ground_to_image(ground)).all()
+
+
 def test_a_camera_that_also_sees_the_sky_has_the_box_of_its_ground() -> None:
     """The horizon is 66 degrees from straight down, and the ends of this line 68: they see no ground."""
     model = north()
@@ -378,17 +385,18 @@ def test_a_model_never_changes() -> None:
 
 @pytest.mark.parametrize(("path", "attitude"), [(3, 1), (1, 3), (2, 1), (1, 5)])
 def test_path_and_attitude_may_be_splines_of_different_degrees(path: int, attitude: int) -> None:
-    """Ground on the rays of the image has the place in the image that it came from."""
+    """Ground on the rays of the image has the place in the image that it came from, also before and after all knots."""
     random = np.random.default_rng(4)
     knots, other = np.array([0.0, 0.5, 1.2]), np.array([-0.1, 0.3, 0.9, 1.4])
     times = Spline(path, knots, np.zeros((2 + path, 3))).sites
     along = np.column_stack([SPEED * times, *random.normal(0, 30.0, (2, len(times)))])
-    turns = random.normal(0, 1e-3, (3 + attitude, 3))
+    turns = random.normal(0, 3e-4, (3 + attitude, 3))
     model = odd(
         path=Spline(path, knots, along), attitude=Spline(attitude, other, turns),
         attitude_line=np.array([[0.01, -0.02, 0.03], [1e-3, 2e-3, -3e-3]]),
     )  # fmt: skip
-    image = np.array([[0.0, 0.0], [1000.0, 600.0], [123.4, 567.8], [500.0, 300.0], [700.0, 250.0], [20.0, 110.0]])
-    ground = model.image_to_ground(image, np.array([0.0, 900.0, 500.0, 300.0, 100.0, 800.0]))
+    image = np.array([[0.0, 0.0], [1000.0, 600.0], [123.4, 567.8], [500.0, 300.0], [700.0, 250.0], [20.0, 110.0],
+                      [400.0, -150.0], [800.0, 780.0]])  # fmt: skip
+    ground = model.image_to_ground(image, np.array([0.0, 900.0, 500.0, 300.0, 100.0, 800.0, 200.0, 700.0]))
     assert np.isfinite(ground).all()
     np.testing.assert_allclose(model.ground_to_image(ground), image, atol=1e-4)
