@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from measured import points_of
 from ortho_studies.simulation.scanner import LineScanner
+from scipy.interpolate import KroghInterpolator
 from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
@@ -207,6 +208,7 @@ def test_rounded_rotations_are_made_rotations() -> None:
     rounded = replace(model, mounting=np.round(model.mounting, 6), orbital=np.round(model.orbital, 6))
     image = sample(scanner(), 100)[0]
     assert np.abs(rounded.ground_to_image(rounded.image_to_ground(image, 300.0)) - image).max() < 1e-7
+    assert not rounded.mounting.flags.writeable
     again = model_from_dict(json.loads(json.dumps(rounded.to_dict())))
     assert again.to_dict() == rounded.to_dict()
 
@@ -309,8 +311,12 @@ def test_a_camera_of_polynomials() -> None:
     powers = column[:, None] ** np.arange(4)
     assert np.abs(camera.directions(column) - np.stack([powers @ across, powers[:, :3] @ along], axis=1)).max() < 1e-15
     assert len(LineCamera.of_polynomials(10, 10, [0.0, 1e-5], []).dx) == 0
-    with pytest.raises(InputError):
-        LineCamera.of_polynomials(10, 10, [0.1], [0.0])
+    for across in ([0.1], [0.1, 0.0], [0.1, 0.0, 1e-9]):
+        with pytest.raises(InputError, match="does not change with the column"):
+            LineCamera.of_polynomials(10, 10, across, [0.0])
+    with pytest.raises(InputError, match="a focal length that is not zero"):
+        LineCamera(10, 10, 5.0, 0.0, 0.0)
+    assert LineCamera(1, 1, 0.5, 0.0, 1.0).directions(np.array([1.0])).tolist() == [[0.5, 0.0]]
 
 
 # -- splines ---------------------------------------------------------------------------------------------------------
@@ -350,6 +356,8 @@ def test_a_spline_needs_data_everywhere() -> None:
         ("coefficients", np.zeros((3, 3))),
         ("coefficients", np.full((4, 3), np.nan)),
         ("beyond", 4),
+        ("degree", 3.0),
+        ("beyond", 1.5),
     ],
 )
 def test_what_is_no_spline(name: str, value: object) -> None:
@@ -729,6 +737,9 @@ def test_a_camera_of_a_table_of_look_angles() -> None:
     assert straight.focal_length == pytest.approx(-2000.0)
     assert (straight.principal_column, straight.principal_line) == pytest.approx((480.0, 2.0))
     assert len(straight.dx) == len(straight.dy) == 0
+    near = np.array([3.0, 3.5, 4.0])
+    close = LineCamera.of_table(1000, 500, near, (near - 480.0) / 2000.0, np.zeros(3))
+    assert close.focal_length == pytest.approx(2000.0)
     # A zigzag of 0.02 px is rounding if the table is rounded to that, else no line of detectors.
     zigzag = u + 0.02 / 2000 * (-1.0) ** np.arange(21)
     assert len(LineCamera.of_table(1000, 500, x, zigzag, v, rounding=0.03).dx) == 4
@@ -785,6 +796,19 @@ def test_lagrange_follows_polynomials_of_degree_seven_and_short_tables() -> None
         assert np.allclose(values, np.stack([wanted**degree, wanted, 1 + 0 * wanted], axis=1), rtol=1e-9, atol=1e-6)
         slopes = degree * wanted ** (degree - 1)
         assert np.allclose(rates, np.stack([slopes, 1 + 0 * wanted, 0 * wanted], axis=1), rtol=1e-7, atol=1e-5)
+
+
+def test_lagrange_takes_the_four_neighbours_on_each_side() -> None:
+    """Of values that no polynomial follows, against SciPy; near the ends of a table the first or the last eight."""
+    random = np.random.default_rng(3)
+    times, values = np.cumsum(random.uniform(0.5, 1.5, 20)), random.normal(size=(20, 3))
+    for after, first in ((10, 6), (13, 9), (4, 0), (1, 0), (17, 12), (19, 12)):
+        wanted = np.array([0.7 * times[after - 1] + 0.3 * times[after]])
+        near = slice(first, first + 8)
+        polynomial = KroghInterpolator(times[near], values[near])
+        found, rates = lagrange(times, values, wanted)
+        np.testing.assert_allclose(found, polynomial(wanted), rtol=1e-8)
+        np.testing.assert_allclose(rates, polynomial.derivative(wanted), rtol=1e-8)
 
 
 @pytest.mark.parametrize(

@@ -71,14 +71,15 @@ def test_a_table_may_be_short_by_a_part_of_the_image(table: str, slack: float, p
             assert refused.value.field == table
 
 
-def test_a_table_may_always_be_short_by_a_row() -> None:
+@pytest.mark.parametrize("period", [1e-3, -1e-3])
+def test_a_table_may_always_be_short_by_a_row(period: float) -> None:
     for part, enough in ((0.95, True), (1.05, False)):
-        short = np.linspace(part * 1e-3, 1.0, 24)
+        short = np.sort(np.linspace(part, 1000.0, 24) * period)
         if enough:
-            made(LONG, short, rows=200)
+            made(LONG, short, rows=200, period=period)
         else:
             with pytest.raises(InputError):
-                made(LONG, short, rows=200)
+                made(LONG, short, rows=200, period=period)
 
 
 def test_path_and_attitude_are_followed_half_an_image_beyond_both_ends() -> None:
@@ -91,9 +92,12 @@ def test_path_and_attitude_are_followed_half_an_image_beyond_both_ends() -> None
     ):
         breaks = made(LONG, LONG + 0.013, rows=rows, period=period).path.breaks
         np.testing.assert_allclose(breaks, np.linspace(*ends, pieces + 1), atol=1e-12)
-    for one, other in ((LONG, np.linspace(-0.4, 2.7, 40)), (np.linspace(-0.4, 2.7, 40), LONG)):
-        breaks = made(one, other).path.breaks
-        np.testing.assert_allclose(breaks[[0, -1]], [-0.4, 2.7], atol=1e-12)
+    short = np.linspace(-0.4, 2.7, 40)
+    # The attitude has the rows around this span, where there are some.
+    for orbits, turns, ends in ((LONG, short, (-0.4, 2.7)), (short, LONG, (-0.5, 2.75))):
+        model = made(orbits, turns)
+        np.testing.assert_allclose(model.path.breaks[[0, -1]], [-0.4, 2.7], atol=1e-12)
+        np.testing.assert_allclose(model.attitude.breaks[[0, -1]], ends, atol=1e-12)
     forms = made(LONG, LONG, splines=SplineForm(3, path=5, attitude=4))
     np.testing.assert_allclose(forms.path.breaks, np.linspace(-1.0, 3.0, 6), atol=1e-12)
     # The attitude has the rows of the table around this span: each quarter of a second.
@@ -177,3 +181,14 @@ def test_a_table_needs_one_row_more_than_the_degree() -> None:
         for tables in ((four[[0, *range(2, degree + 1)]], four), (four, four[[0, *range(2, degree + 1)]])):
             with pytest.raises(InputError, match=f"more than {degree} times"):
                 made(*tables, splines=SplineForm(degree))
+
+
+def test_one_mirrored_row_of_an_attitude_is_refused() -> None:
+    turns = level(LONG) @ CAMERA
+    turns[7] *= (-1.0, 1.0, 1.0)
+    with pytest.raises(InputError, match="not a rotation") as refused:
+        pushbroom_of_tables(
+            LineCamera(1000, 2000, 500.0, 0.0, 1e5), line_period=1e-3, first_time=0.0, orbit=(LONG, orbit(LONG)),
+            attitude=(LONG, turns),
+        )  # fmt: skip
+    assert refused.value.field == "attitude"
