@@ -97,6 +97,18 @@ def test_numbers_of_no_scene_on_earth_are_refused_with_their_field(name, value):
     assert name in str(caught.value.field)
 
 
+@pytest.mark.parametrize("name", [name for name in NUMBERS if name.endswith("scale")])
+def test_a_scale_of_zero_is_refused_with_its_field(name):
+    with pytest.raises(InputError, match="cannot be zero") as caught:
+        simple(**{name: 0.0})
+    assert caught.value.field == name
+
+
+def test_heights_may_have_a_scale_of_a_metre_and_longitudes_an_offset_of_zero():
+    model = simple(h_scale=1.0, lon_off=0.0)
+    assert (model.height_range, model.domain[0][0]) == ((699.0, 701.0), 0.0)
+
+
 def test_coefficients_whose_pixels_are_too_large_for_numbers_are_refused():
     with pytest.raises(InputError, match="finite coefficients") as caught:
         simple(col_num=np.eye(20)[1] + 1e308 * np.eye(20)[13])
@@ -113,6 +125,25 @@ def test_a_pole_at_heights_far_from_the_middle_takes_these_heights_away():
     ground = np.array([[24.5, -33.6, low - 1.0], [24.5, -33.6, low + 1.0], [24.5, -33.6, 100.0]])
     np.testing.assert_array_equal(np.isfinite(model.ground_to_image(ground)[:, 0]), [False, True, False])
     assert low < model.reference_height < high
+
+
+def test_negative_scales_count_coordinates_and_pixels_the_other_way():
+    """The same camera as with positive ones, with a pole that takes the lower heights away."""
+    model = simple(row_den=np.eye(20)[0] + 1.4 * np.eye(20)[3])
+    signs = np.prod((-1.0) ** RPC_TERMS, axis=1)
+    changes = {name: -getattr(model, name) for name in NUMBERS if name.endswith("_scale")}
+    changes |= {name: getattr(model, name) * (signs if "den" in name else -signs) for name in COEFFICIENTS}
+    turned = dataclasses.replace(model, **changes)
+    np.testing.assert_allclose(turned.domain, model.domain)
+    assert turned.height_range == pytest.approx(model.height_range)
+    assert turned.height_limits == pytest.approx(model.height_limits)
+    places = np.random.default_rng(6).uniform(-1.7, 1.7, (200, 3))
+    ground = (model.lon_off, model.lat_off, model.h_off) + places * (0.1, 0.1, 500.0)
+    image = model.ground_to_image(ground)
+    seen = np.isfinite(image[:, 0])
+    assert 20 < seen.sum() < 180
+    np.testing.assert_allclose(turned.ground_to_image(ground), image, atol=1e-7)
+    np.testing.assert_allclose(turned.image_to_ground(image[seen], ground[seen, 2]), ground[seen], atol=1e-9)
 
 
 def test_mutants_that_are_accepted_have_no_pole_in_their_box():
