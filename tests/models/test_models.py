@@ -164,6 +164,18 @@ def test_inverse_gives_nan_instead_of_a_false_root():
     assert np.isnan(model.image_to_ground([[6000.0, 6000.0]], np.nan)).all()
 
 
+@pytest.mark.parametrize("count", [3, COMPILED_FROM])
+def test_all_points_have_one_height_or_each_its_own(count):
+    model = make_rpc()
+    image = np.random.default_rng(2).uniform(1000, 9000, (count, 2))
+    for one in (800.0, [800.0], np.full(count, 800.0)):
+        np.testing.assert_allclose(model.ground_to_image(model.image_to_ground(image, one)), image, atol=1e-6)
+        np.testing.assert_array_equal(model.image_to_ground(image, one)[:, 2], 800.0)
+    for wrong in ([800.0, 900.0], np.full((count, 1), 800.0)):
+        with pytest.raises(InputError, match="height must be one number or have the shape"):
+            model.image_to_ground(image, wrong)
+
+
 def test_ground_far_outside_has_no_image():
     model = make_rpc()
     assert np.isnan(model.ground_to_image([[24.4 + 1.6 * 0.034, -33.65, 700.0]])).all()
@@ -245,6 +257,18 @@ def test_correction_is_the_stated_affine_transformation():
     )
     np.testing.assert_allclose(model.ground_to_image(ground), expected, atol=1e-9)
     np.testing.assert_allclose(rpc.ground_to_image(ground) @ model.matrix.T + model.offset, expected, atol=1e-8)
+
+
+def test_a_correction_may_mirror_an_image_but_not_map_it_to_a_line():
+    rpc = make_rpc()
+    # Columns by 2 and 1, rows by 4 and 2.
+    with pytest.raises(InputError, match="cannot be inverted"):
+        ImageCorrection(rpc, "affine", (5000, 6000), [0.0, 1.0, 1.0, 0.0, 4.0, 1.0])
+    mirror = ImageCorrection(rpc, "affine", (5000, 6000), [0.0, -2.0, 0.0, 0.0, 0.0, 0.0])
+    ground = box_of(rpc, 20)
+    image = rpc.ground_to_image(ground) * (-1.0, 1.0) + (10_000.0, 0.0)
+    np.testing.assert_allclose(mirror.ground_to_image(ground), image, atol=1e-8)
+    np.testing.assert_allclose(mirror.image_to_ground(image, ground[:, 2]), ground, atol=1e-9)
 
 
 def test_unknown_correction_is_refused():
