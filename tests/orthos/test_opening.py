@@ -54,6 +54,9 @@ def test_the_map_grid_is_a_sensor_model(name):
     centre, half = model.domain
     check_sensor_model(model, centre + half * np.random.default_rng(0).uniform(-0.8, 0.8, (20, 3)))
     assert not model.uses_height
+    # Of all ground, from the Dead Sea to the summit of Everest.
+    assert model.height_range[0] < -430
+    assert model.height_range[1] > 8849
     # GDAL's own geotransform is the authority.
     x, y = gdal.ApplyGeoTransform(transform, 12.5, 7.25)
     np.testing.assert_allclose(model.ground_to_image([[x, y, 123.0]]), [[12.5, 7.25]], atol=1e-7)
@@ -66,6 +69,14 @@ def test_longitudes_are_counted_as_the_map_counts_them():
     np.testing.assert_allclose(model.ground_to_image([[-160.0, 9.0, 0.0]]), [[10.0, 10.0]], atol=1e-9)
 
 
+@pytest.mark.parametrize("west", [-180.0, 0.0])
+def test_a_map_of_the_whole_earth_has_each_longitude_within(west):
+    model = MapGrid("EPSG:4326", (west, 0.1, 0.0, 90.0, 0.0, -0.1), (3600, 1800))
+    for longitude in (-170.0, -10.0, 10.0, 170.0, 190.0):
+        column = (longitude - west) % 360 * 10
+        np.testing.assert_allclose(model.ground_to_image([[longitude, 9.0, 0.0]]), [[column, 810.0]], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     "transform",
     [
@@ -76,6 +87,12 @@ def test_longitudes_are_counted_as_the_map_counts_them():
 def test_a_geotransform_that_cannot_be_inverted_is_refused(transform):
     with pytest.raises(InputError, match="cannot be inverted"):
         MapGrid("EPSG:32636", transform, (60, 40))
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4978", "EPSG:5773"])
+def test_a_map_has_a_horizontal_crs(crs):
+    with pytest.raises(CrsError, match="no horizontal coordinates"):
+        MapGrid(crs, GRIDS["metres"][1], (60, 40))
 
 
 @pytest.mark.parametrize(

@@ -366,10 +366,21 @@ def test_relief_lies_on_the_line_to_the_satellite(azimuth, elevation, corner):
         np.testing.assert_allclose(found, seen, atol=1e-3)
 
 
-def test_azimuth_and_elevation_come_back():
-    azimuth, elevation = plane().view
-    assert math.degrees(azimuth) == pytest.approx(AZIMUTH, abs=1e-4)
-    assert math.degrees(elevation) == pytest.approx(ELEVATION, abs=1e-4)
+def seen_from(azimuth: float, elevation: float) -> MapPlane:
+    angles = math.radians(azimuth), math.radians(elevation)
+    return MapPlane.from_view(UTM, CORNER, (1.0, 1.0), SIZE, PLANE, *angles, HEIGHTS)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(AZIMUTH, ELEVATION), (301.0, 72.0), (200.0, 5.1)])
+def test_azimuth_and_elevation_come_back(azimuth, elevation):
+    """From five degrees above the horizon on."""
+    view = np.degrees(seen_from(azimuth, elevation).view)
+    np.testing.assert_allclose(view, (azimuth, elevation), rtol=0, atol=1e-4)
+
+
+def test_heights_of_a_plane_include_the_plane():
+    assert plane().with_heights(1310.0, 1390.0).height_range == (PLANE, 1390.0)
+    assert plane().with_heights(1210.0, 1290.0).height_range == (1210.0, PLANE)
 
 
 @pytest.mark.parametrize(
@@ -384,10 +395,10 @@ def test_impossible_planes_are_refused(changes):
         plane(**changes)
 
 
-@pytest.mark.parametrize("elevation", [0.01, math.radians(90.1)])
-def test_a_satellite_at_the_horizon_or_beyond_the_zenith_is_refused(elevation):
+@pytest.mark.parametrize("elevation", [0.5, 4.9, 90.1])
+def test_a_satellite_near_the_horizon_or_beyond_the_zenith_is_refused(elevation):
     with pytest.raises(InputError, match="an elevation of"):
-        MapPlane.from_view(UTM, CORNER, (1.0, 1.0), SIZE, PLANE, 1.0, elevation, HEIGHTS)
+        seen_from(57.0, elevation)
 
 
 def measured(model: MapPlane, count: int, tmp_path: Path, noise: float = 0.0) -> Path:
