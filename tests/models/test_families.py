@@ -114,6 +114,9 @@ def test_flat_ground_has_as_many_metres_of_height_in_any_crs():
     longest = metres[2] / np.cos(np.radians(points.to_crs("EPSG:4979").ground[:, 1].mean()))
     assert 0.95 * metres[2] < degrees[2] < 1.05 * longest
     assert metres[2] > 5.0
+    feet = start_model("affine3d", flat, crs="+proj=utm +zone=33 +datum=WGS84 +units=us-ft").domain[1]
+    assert feet[0] > 3 * metres[0]
+    assert feet[2] == pytest.approx(metres[2], rel=1e-6)
 
 
 def test_crs_of_models():
@@ -261,6 +264,11 @@ def test_points_without_heights_suit_models_of_the_plane():
     np.testing.assert_allclose(found.residuals, fit_family("poly2", points, size=SIZE).residuals, atol=1e-8)
     with pytest.raises(TooFewPoints):
         fit_family("affine3d", flat)
+    # Those with a height do not take the others out.
+    ground[::3] = points.ground[::3]
+    some = fit_family("poly2", points.with_ground(ground), size=SIZE)
+    assert some.used.all()
+    np.testing.assert_allclose(some.residuals, found.residuals, atol=1e-8)
 
 
 def test_unit_and_place_of_the_coordinates_do_not_matter():
@@ -343,7 +351,7 @@ def test_collinear_points():
     """Rounding of UTM coordinates hides from a rank test that these lie on a line."""
     along = np.linspace(0, 1, 12)[:, None]
     ground = LOW + (HIGH - LOW) * along + np.array([0.1, 0.2, 0.3]) * along
-    for name in ("affine2d", "projective", "affine3d"):
+    for name in ("affine2d", "projective", "affine3d", "affine14"):
         with pytest.raises(DegeneratePoints, match="condition"):
             fit_family(name, make_points(12, ground=ground))
 
@@ -362,6 +370,9 @@ def test_too_few_points(name):
     with pytest.raises(TooFewPoints) as caught:
         fit_family(name, make_points(least - 1))
     assert f"at least {least}" in caught.value.remedy
+    with pytest.raises(TooFewPoints) as caught:
+        fit(start_model(name, make_points(100)), make_points(1))
+    assert "a simpler model" in caught.value.remedy
 
 
 def test_no_redundancy():

@@ -65,6 +65,13 @@ def test_rational_functions(order: int, common: bool) -> None:
     assert made in families()
 
 
+def test_rational_functions_alone_are_regularised() -> None:
+    """Perspective needs none: its denominators are of the first order and common."""
+    assert {family.name for family in families() if family.regularised} == {
+        "rfm1", "rfm2", "rfm3", "rfm2-common", "rfm3-common",
+    }  # fmt: skip
+
+
 def test_points_give_two_equations_and_each_axis_needs_its_own() -> None:
     assert points_needed(("col_1", "col_X", "col_Y", "row_1")) == 3
     assert points_needed(("col_1", "row_1", "den_X", "den_Y", "den_Z")) == 3
