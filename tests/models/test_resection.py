@@ -99,6 +99,8 @@ def test_as_many_points_as_are_needed_are_enough():
     known = TRUTH.exterior[:3]
     found = resect(points(3), INTERIOR, map_crs="EPSG:32636", position=known)
     assert np.abs(found.exterior - TRUTH.exterior).max() < 1e-3
+    near = resect(points(3), INTERIOR, map_crs="EPSG:32636", position=known + np.array([30, -20, 40]))
+    assert np.abs(near.ground_to_image(points(3).ground) - points(3).image).max() < 1e-3
     with pytest.raises(TooFewPoints):
         resect(points(2), INTERIOR, map_crs="EPSG:32636", position=known)
 
