@@ -89,6 +89,24 @@ def test_one_number_that_is_not_finite_is_refused(name: str, bad: float) -> None
                 dataclasses.replace(make(), **{field: values if good.ndim > 1 else tuple(values.tolist())})
 
 
+@pytest.mark.parametrize("name", MADE)
+def test_nobody_changes_the_numbers_of_a_model(name: str) -> None:
+    """Neither through its arrays, nor through those that it was made from."""
+    make, fields = MADE[name]
+    for field in fields:
+        given = np.array(getattr(make(), field), dtype=float)
+        made = dataclasses.replace(make(), **{field: given})
+        kept = np.array(getattr(made, field))
+        given += 1.0
+        np.testing.assert_array_equal(getattr(made, field), kept)
+        if isinstance(values := getattr(made, field), np.ndarray):
+            assert not values.flags.writeable, field
+
+
+def test_nobody_turns_a_camera_through_its_rotation() -> None:
+    assert not camera().rotation.flags.writeable
+
+
 def test_one_sigma_of_zero_or_one_time_that_goes_back_is_refused() -> None:
     sigma = np.ones((2, 3))
     sigma[1, 2] = 0.0
