@@ -70,6 +70,17 @@ def test_no_number_of_points_makes_it_less(rpc: RPC) -> None:
         np.testing.assert_allclose(found.student, alone.student, rtol=1e-6)
 
 
+def test_of_common_errors_of_two_sizes_the_larger_is_published_and_the_mean_moves_a_shift(rpc: RPC) -> None:
+    points = scene(rpc, np.random.default_rng(1), 40, 0, sigma=2.0, off=np.zeros(2))
+    sizes = np.where(np.arange(40) < 20, 0.4, 0.8)
+    found = adjusted(rpc, replace(points, sigma_common=sizes))
+    assert found.common_error is not None
+    assert found.to_json()["statistics"]["common_error"]["sigma_m"] == 0.8
+    np.testing.assert_allclose(found.common_error.covariance, PLAN @ PLAN.T * 0.6**2, rtol=0.01)
+    # Nothing takes it up in a model without parameters.
+    assert adjusted(rpc, replace(points, sigma_common=sizes), "none").common_error is None
+
+
 @pytest.mark.parametrize("kind", ["shift", "affine"])
 @pytest.mark.parametrize("surveyed", [0, pytest.param(6, marks=pytest.mark.slow)])
 def test_sigmas_cover_where_the_reference_lies_anywhere(rpc: RPC, kind: str, surveyed: int) -> None:
@@ -100,9 +111,10 @@ def dense(rpc: RPC, points: Points, kind: str) -> tuple[np.ndarray, np.ndarray]:
     return covariance @ design.T @ weight @ observed, covariance
 
 
-@pytest.mark.parametrize("kind", ["shift", "shift-drift", "affine"])
-def test_points_without_it_correct_it_as_generalised_least_squares_does(rpc: RPC, kind: str) -> None:
-    points = scene(rpc, np.random.default_rng(3), 50, 5, sigma=2.0, off=np.array([2.5, -1.5]))
+@pytest.mark.parametrize(("kind", "sigma"), [("shift", 2.0), ("shift", 0.8), ("shift-drift", 2.0), ("affine", 2.0)])
+def test_points_without_it_correct_it_as_generalised_least_squares_does(rpc: RPC, kind: str, sigma: float) -> None:
+    off = np.array([1.25, -0.75]) * sigma
+    points = scene(rpc, np.random.default_rng(3), 50, 5, sigma=sigma, off=off)
     points = replace(points, groups=None)
     found = adjusted(rpc, points, kind)
     values, covariance = dense(rpc, points, kind)
@@ -113,8 +125,8 @@ def test_points_without_it_correct_it_as_generalised_least_squares_does(rpc: RPC
     np.testing.assert_allclose(whole / size / size[:, None], covariance / size / size[:, None], atol=0.02)
     said = found.to_json()["statistics"]["common_error"]
     assert said["points"] == 50
-    assert said["sigma_m"] == 2.0
-    np.testing.assert_allclose(said["estimate_m"], (2.5, -1.5), atol=3 * max(said["estimate_sigma_m"]))
+    assert said["sigma_m"] == sigma
+    np.testing.assert_allclose(said["estimate_m"], off, atol=3 * max(said["estimate_sigma_m"]))
     assert max(said["estimate_sigma_m"]) < 0.3
     # The common error explains the 3 m, so the residuals are small.
     assert found.rmse("control").total < 0.6

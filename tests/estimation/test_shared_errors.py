@@ -255,6 +255,8 @@ def test_groups_too_few_to_estimate_count_as_one_point_each(rpc: RPC) -> None:
     assert found.shared_errors.range_px is None
     assert found.effective_points == 4
     np.testing.assert_allclose(found.sigmas, np.hypot(np.sqrt(3) * alone.sigmas, MATCHED_ALIKE), rtol=1e-12)
+    single = adjusted(rpc, points.select([0]))
+    assert (single.sigma0, single.shared_errors) == (None, None)
 
 
 def test_surveyed_points_among_matched_ones_count_as_they_are(rpc: RPC) -> None:

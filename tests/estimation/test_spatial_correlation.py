@@ -284,6 +284,11 @@ def test_control_and_check_are_apart_and_in_metres():
     assert rmse is not None
     assert found.check.unit == "m"
     assert np.hypot(*found.check.absolute) == pytest.approx(2.5 * rmse.total, rel=0.1)
+    # A check point of unknown position is left out, and no other.
+    ground = result.points.ground.copy()
+    ground[np.flatnonzero(result.points.check)[0], 0] = np.nan
+    known = section(dataclasses.replace(result, points=result.points.with_ground(ground)))
+    assert (known.control, known.check.n) == (found.control, 11)
     # Distances are those of the ground: the scene is 2.5 km wide.
     last = found.control.classes[-1]
     assert 2000 < last.to_m < 3600

@@ -63,6 +63,16 @@ def test_displacements_that_contradict_their_neighbours_are_local():
     assert DisplacementField.of(place[~wrong], value[~wrong]).local.sum() == 0
 
 
+def test_a_displacement_contradicts_its_neighbours_from_four_and_a_half_sigmas_on():
+    """Of 60 displacements of 0.1 to any side, one is 0.4 to the right, 3.6 of its sigmas, and one 2 downwards."""
+    random = np.random.default_rng(7)
+    place, value = random.uniform(0, 1000, (60, 2)), random.choice([-0.1, 0.1], (60, 2))
+    value[5, 0], value[9, 1] = 0.4, 2.0
+    others = np.arange(60) != 9
+    np.testing.assert_allclose(value[others].std(axis=0), (0.11, 0.1), rtol=0.03)
+    assert np.flatnonzero(DisplacementField.of(place, value).local).tolist() == [9]
+
+
 def test_the_trend_of_a_plane_is_its_coefficients():
     """At the middle of the places, and per unit of x and y, whatever the unit is."""
     random = np.random.default_rng(3)
