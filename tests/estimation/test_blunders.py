@@ -245,6 +245,16 @@ def test_a_check_point_is_reported_if_one_good_set_in_a_hundred_has_such_a_point
 
 
 @pytest.mark.parametrize("part", [0.99, 1.01])
+def test_a_check_point_is_tested_by_the_only_observation_to_spare(level: RPC, part: float) -> None:
+    """One point and a shift of columns: its row, 0.4 px off, is all that is known of the noise."""
+    distance = part * 0.4 * math.sqrt(2 * stats.f.isf(0.01, 2, 1))
+    points = points_of(level, np.array([(7.0, 0.4), (7.0, distance)]), 1)
+    model = ImageCorrection.identity(level, "shift", (1000.0, 1000.0)).without(["row_shift"])
+    solution = Problem.of(model, points, points.control, {}).solve(np.ones(1, dtype=bool))
+    assert [point.id for point in outlying(solution, points, points.control)] == ["2"][: part > 1]
+
+
+@pytest.mark.parametrize("part", [0.99, 1.01])
 def test_the_scatter_of_five_check_points_is_their_scale(level: RPC, part: float) -> None:
     """By the median of their squares, with five degrees of freedom; four are compared with the control points."""
     control = drawn(9)
@@ -286,7 +296,7 @@ def test_three_measured_check_points_are_compared_with_each_other_if_all_control
     # One measured control point gives the offset; so do check points that were matched themselves.
     assert len(found(replace(matched, groups=np.array([-1, *range(8), -1, -1, -1, -1])))) == 4
     assert len(found(replace(matched, groups=np.array([*range(9), 20, 21, 22, -1])))) == 4
-    offset = found(replace(matched, groups=np.array([*range(9), 20, -1, -1, -1])))
+    offset = found(replace(matched, groups=np.array([*range(1, 10), 0, -1, -1, -1])))
     assert offset["10"] == pytest.approx(np.hypot(*away[0]))
     assert offset["12"] == pytest.approx(np.hypot(*(off[2] - np.median(off[1:], axis=0))))
 
@@ -298,9 +308,11 @@ def named(*ids: str) -> list[OutlyingPoint]:
     return [OutlyingPoint.of(name, "check", 9.0, 1.0, 1e-6) for name in ids]
 
 
-def apart(level: RPC, sizes: Any, outliers: list[OutlyingPoint], *, shared: bool = False, **more: Any) -> Any:
+def apart(
+    level: RPC, sizes: Any, outliers: list[OutlyingPoint], *, shared: bool = False, scatter: float = 1.0, **more: Any
+) -> Any:
     """Return the fields of the notice of check points so many times the expected error away; None without a notice."""
-    control = drawn(9)
+    control = scatter * drawn(9)
     usual = math.sqrt(control.var(axis=0, ddof=1).sum() * 10 / 9)
     checks = control.mean(axis=0) + np.asarray(sizes)[:, None] * usual * DIRECTION
     points = points_of(level, np.vstack([control, checks]), len(checks), **more)
@@ -334,8 +346,9 @@ def test_check_points_that_are_apart_together_count_from_three_times_the_expecte
     assert found["rest"] == pytest.approx(math.sqrt((2.97**2 + 2.5**2 + 2.2**2) / 3))
     both = apart(level, [2.7, 2.8], [])
     assert (both["off"], both["count"], both["points"], both["rest"]) == (0, 2, ["11", "10"], None)
-    single = apart(level, [2.7], [])
-    assert (single["off"], single["count"], single["points"], single["rest"]) == (1, 1, ["10"], None)
+    for scatter in (1.0, 0.1):
+        single = apart(level, [2.7], [], scatter=scatter)
+        assert (single["off"], single["count"], single["points"], single["rest"]) == (1, 1, ["10"], None)
     five = apart(level, [2.5, 2.9, 2.6, 2.8, 2.7], [])
     assert (five["off"], five["points"]) == (0, ["11", "13", "14"])
     assert apart(level, [2.7, 2.8], [], shared=True) is None

@@ -53,3 +53,16 @@ def test_sigmas_hold_if_points_are_better_or_worse_than_stated(real: float) -> N
 def test_a_few_points_do_not_outweigh_the_pose(count: int) -> None:
     for one in ratios(0.5, count, 25):
         assert 0.75 < np.sqrt((one**2).mean()) < 1.3
+
+
+def test_a_gross_error_is_found_among_fewer_points_than_parameters() -> None:
+    """With priors for all six parameters, a single point determines the camera, and the others test it."""
+    random = np.random.default_rng(2)
+    true = FrameCamera.from_roll_pitch_yaw(INTERIOR, [33.0, 37.0, 1000.0], 0.01, -0.02, 2.0, heights=(0.0, 100.0))
+    image = np.array([[700.0, 500.0], [5200.0, 900.0], [4800.0, 3500.0], [900.0, 3100.0], [2900.0, 2100.0]])
+    ground = true.image_to_ground(image, random.uniform(40, 60, 5))
+    image += random.normal(0, 0.5, (5, 2))
+    image[3] += 400.0, -300.0
+    priors = {name: Prior(*one) for name, one in zip(EXTERIOR, zip(true.exterior, SIGMAS, strict=True), strict=True)}
+    found = fit(true, Points.of(image, ground, "EPSG:4979", sigma_image=0.5), priors=priors)
+    assert [name for name, _ in found.rejected] == ["4"]

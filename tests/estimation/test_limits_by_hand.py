@@ -79,9 +79,10 @@ def test_check_points_are_apart_together_if_they_are_twice_as_far_and_not_by_cha
     # Five points have ten coordinates; twice the error is four times the square.
     assert _together_apart(np.full(5, 8.1 * 0.25), 0.25, 1000.0)
     assert not _together_apart(np.full(5, 7.9 * 0.25), 0.25, 1000.0)
-    for part, apart in ((1.01, True), (0.99, False)):
-        square = part * float(stats.f.isf(0.01, 2, 7.0)) * 2
-        assert _together_apart(np.array([square]), 1.0, 7.0) is apart
+    for freedom in (7.0, 1.0):
+        for part, apart in ((1.01, True), (0.99, False)):
+            square = part * float(stats.f.isf(0.01, 2, freedom)) * 2
+            assert _together_apart(np.array([square]), 1.0, freedom) is apart
     assert not _together_apart(np.zeros(0), 1.0, 7.0)
 
 
@@ -218,6 +219,11 @@ def test_a_covariance_function_that_is_there_is_found() -> None:
     found = _function(distance, halves)
     assert found is not None
     assert (found.noise, found.systematic, found.range_m) == pytest.approx((0.3, 0.8, 700.0), rel=1e-3)
+    # Two points with the same error hide it no more than others.
+    halves[40] = 0.0
+    same = _function(distance, halves)
+    assert same is not None
+    assert (same.noise, same.systematic, same.range_m) == pytest.approx((0.3, 0.8, 700.0), rel=0.1)
     # Without noise, and without a part that falls with the distance.
     pure = _function(distance, 0.8**2 * (1.0 - np.exp(-distance / 700.0)))
     assert pure is not None

@@ -78,6 +78,7 @@ def test_student():
     # The table of every textbook: 2.228 for 10 degrees of freedom and 5 %.
     np.testing.assert_allclose(t, [2.228, 0.0])
     np.testing.assert_allclose(p, [0.05, 1.0], atol=1e-4)
+    assert student_of(np.array([12.706]), np.eye(1), 1)[1] == pytest.approx(0.05, abs=1e-4)
     assert student_of(np.array([1.96]), np.eye(1), 0)[1] == pytest.approx(0.05, abs=1e-4)
 
 
