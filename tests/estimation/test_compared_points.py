@@ -9,7 +9,8 @@ import pytest
 
 from ortho_pipeline.estimation.choice.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
-from ortho_pipeline.models import RPC
+from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.points import Points
 
 MODELS = ("affine2d", "affine3d", "dlt")
@@ -61,3 +62,26 @@ def test_a_point_that_a_poor_model_alone_rejects_is_used_by_it(level: RPC) -> No
     assert plane is not None
     # Without heights the model cannot follow a summit 400 m above the rest: 100 px.
     assert np.abs(plane.residuals[:, 0]).max() == pytest.approx(100.0, rel=0.3)
+
+
+def test_corrections_of_the_scenes_own_model_are_about_the_middle_of_its_image(level: RPC) -> None:
+    """Far from it, a shift would depend on the slopes."""
+    points = seen(level, np.full(24, 500.0))
+    points = replace(points, image=points.image * 1.001 + (4.0, -3.0))
+    done = compare(points, ("rpc", "rpc+affine"), own=level, size=(2000, 1200))
+    for row, kind in zip(done.rows, ("none", "affine"), strict=True):
+        assert row.fit is not None
+        wanted = fit(ImageCorrection.identity(level, kind, (1000.0, 600.0)), points)
+        np.testing.assert_allclose(row.fit.values, wanted.values, rtol=1e-9)
+        np.testing.assert_allclose(row.fit.residuals, wanted.residuals, atol=1e-9)
+
+
+def test_an_unsuited_model_has_its_warning_and_is_not_recommended(level: RPC) -> None:
+    points = seen(level, np.random.default_rng(4).uniform(300.0, 700.0, 24))
+    assert compare(points, MODELS, size=(2000, 2000)).recommended == "affine3d"
+    why = {"affine3d": "this scanner turns while it scans", "poly5": "not asked for"}
+    done = compare(points, MODELS, size=(2000, 2000), unsuited=why, significance=0.2)
+    assert done.recommended == "dlt"
+    told = {row.model: [one["text"] for one in row.notices if one["code"] == "unsuited-model"] for row in done.rows}
+    assert told == {"affine2d": [], "affine3d": [why["affine3d"]], "dlt": []}
+    assert {row.fit.significance for row in done.rows if row.fit} == {0.2}

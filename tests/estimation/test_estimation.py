@@ -186,11 +186,12 @@ def test_with_few_points_and_priors_stated_sigmas_hold(rpc):
 
 @pytest.mark.parametrize("sigma", [0.05, 0.5, 20.0])
 def test_constraints_of_a_model_are_observations(rpc, sigma):
-    """A shift that was observed as well is the mean of both, by their weights."""
+    """A shift that was observed as well is the mean of both, by their weights, also with a soft constraint."""
 
     class Observed(ImageCorrection):
         def constraints(self) -> Constraints:
-            return Constraints(np.array([1.0 - self.params[0]]), np.array([[1.0, 0.0]]), np.array([sigma]))
+            fictitious = np.array([False, True])
+            return Constraints((1.0, 0.0) - self.params, np.eye(2), np.array([sigma, 1e9]), fictitious)
 
     points = make_points(rpc, count=4, noise=0.5)
     free = fit(start(rpc), points, robust=False)
@@ -260,6 +261,8 @@ def test_too_few_points(rpc, kind, count):
     with pytest.raises(TooFewPoints) as caught:
         fit(start(rpc, kind), make_points(rpc, kind, count=count))
     assert "at least" in caught.value.remedy
+    # Nothing is simpler than a shift.
+    assert ("a simpler correction, such as" in caught.value.remedy) == (kind != "shift")
 
 
 def test_memory_of_fitting_many_points_is_bounded(rpc):

@@ -65,6 +65,18 @@ def test_variances_are_those_of_plain_least_squares(affine: Fit) -> None:
     assert expectation(affine, points.check, None).scene == pytest.approx(mean(ground), rel=0.08)
 
 
+def test_without_redundancy_variances_are_those_of_the_stated_noise() -> None:
+    """Four control points, which an affine camera fits exactly."""
+    control = [[0.1, 0.1, 0.2], [0.9, 0.2, 0.7], [0.2, 0.9, 0.9], [0.8, 0.8, 0.1]]
+    ground = LOW + np.array([*control, [0.5, 0.5, 0.5], [0.6, 0.3, 0.4]]) * (HIGH - LOW)
+    points = points_of(ground).with_roles(["control"] * 4 + ["check"] * 2)
+    fit = fit_family("affine3d", points, size=SIZE, heights=(200.0, 800.0), robust=False)
+    assert fit.sigma0 is None
+    inverse, rows = np.linalg.inv(design_of(ground[:4])), design_of(ground[4:])
+    expected = 2 * SIGMA**2 * ((rows @ inverse) ** 2).sum(axis=1).mean()
+    assert expectation(fit, points.check, SIZE).tested == pytest.approx(expected, rel=1e-6)
+
+
 def test_heights_without_control_displace_a_flat_model(affine: Fit) -> None:
     """By a mean square of a tenth of their variance, in pixels of 2 m; control in all heights leaves none of it."""
     random = np.random.default_rng(5)

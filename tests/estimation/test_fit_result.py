@@ -185,6 +185,16 @@ def test_the_only_parameter_stays(level: RPC) -> None:
         fit_own(level, found.points)
 
 
+def test_own_parameters_are_adjusted_without_gross_errors_unless_all_points_are_wanted(level: RPC) -> None:
+    points = fitted(level).points
+    image = points.image.copy()
+    image[4] += 90.0
+    points = dataclasses.replace(points, image=image)
+    start = ImageCorrection.identity(level, "affine", ORIGIN)
+    assert [name for name, _ in fit_own(start, points).rejected] == [points.ids[4]]
+    assert fit_own(start, points, robust=False).rejected == ()
+
+
 def test_some_parameters_are_adjusted_and_others_zero(level: RPC) -> None:
     model = ImageCorrection(level, "affine", ORIGIN, np.array([1.0, 2e-3, 3e-3, 4.0, 5e-3, 6e-3]))
     assert restricted(model, None) is model

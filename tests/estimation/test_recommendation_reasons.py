@@ -88,8 +88,20 @@ def test_points_that_test_models_are_counted_by_their_kind(base: Fit) -> None:
     alone = dataclasses.replace(base, points=base.points.with_roles(np.where(base.used, "control", "tie")))
     name, reason, criterion = recommend([ComparedModel.of("plain", (8, 4, 3), alone)])
     assert (name, criterion) == ("plain", "leave-one-out")
+    for redundancy, tested in ((1, "plain"), (0, None)):
+        spare = dataclasses.replace(alone, redundancy=redundancy)
+        assert recommend([ComparedModel.of("plain", (8, 4, 3), spare)])[0] == tested
     squares = (base.loo_residuals[:12] ** 2).sum(axis=1)
     assert f"RMSE {math.sqrt(squares.mean()):.3g} px at 12 control points (leave-one-out)" in reason
+
+
+def test_models_are_compared_at_the_points_that_test_all_of_them(base: Fit) -> None:
+    """One model does not project the second check point, where its error would be unknown."""
+    every, lost = CHECKS.copy(), CHECKS / 1.5
+    lost[1] = np.nan
+    name, reason, _ = recommend([row(base, "every", 8, every), row(base, "lost", 8, lost)])
+    assert name == "lost"
+    assert f"RMSE {math.sqrt(np.nanmean(lost)):.3g} px at 4 check points" in reason
 
 
 def test_a_model_without_parameters_is_tested_by_all_its_points(base: Fit) -> None:
