@@ -66,9 +66,10 @@ class CommonExtent:
         xmin, ymin, xmax, ymax = warped_bounds(colours, pan.crs)
         left, right = (xmin - pan.left) / pan.dx, (xmax - pan.left) / pan.dx
         top, bottom = (pan.top - ymax) / pan.dy, (pan.top - ymin) / pan.dy
-        first, last = max(0, math.ceil(left - _SAME)), min(pan.width, math.floor(right + _SAME))
-        upper, lower = max(0, math.ceil(top - _SAME)), min(pan.height, math.floor(bottom + _SAME))
-        if not (all(map(math.isfinite, (left, right, top, bottom))) and first < last and upper < lower):
+        # What is nowhere in this CRS has infinite sides.
+        first, last = math.ceil(_clamped(left - _SAME, pan.width)), math.floor(_clamped(right + _SAME, pan.width))
+        upper, lower = math.ceil(_clamped(top - _SAME, pan.height)), math.floor(_clamped(bottom + _SAME, pan.height))
+        if not (first < last and upper < lower):
             raise InputError("the panchromatic and the multispectral ortho do not overlap")
         grid = part_of(pan, first, upper, last - first, lower - upper)
         ratio = _nesting(pan, colours, left, top)
@@ -77,6 +78,11 @@ class CommonExtent:
         across = _widened(first, last, round(left), round(right), ratio)
         down = _widened(upper, lower, round(top), round(bottom), ratio)
         return cls(grid, part_of(pan, across[0], down[0], across[1] - across[0], down[1] - down[0]), ratio)
+
+
+def _clamped(place: float, count: int) -> float:
+    """Return the nearest place within so many pixels."""
+    return min(max(place, 0.0), count)
 
 
 def _widened(first: int, last: int, begin: int, end: int, ratio: int) -> tuple[int, int]:

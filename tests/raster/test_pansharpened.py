@@ -266,3 +266,11 @@ def test_pixels_of_few_bits_keep_to_them(tmp_path: Path, bits: int) -> None:
     assert valid.sum() == 64 * 64 - 1
     np.testing.assert_array_equal(pixels[:, 5:25], 2**bits - 1)
     np.testing.assert_array_equal(pixels[:, 35:], 1200)
+
+
+def test_an_ortho_that_is_nowhere_on_the_map_of_the_other_has_nothing_in_common() -> None:
+    """PROJ knows no place for it. It was an overflow."""
+    pan = Grid(UTM, 1000.0, 5000.0, 1.0, 1.0, 60, 40)
+    site = pyproj.CRS('LOCAL_CS["a building site",UNIT["metre",1]]')
+    with pytest.raises(InputError, match="do not overlap"):
+        CommonExtent.of(pan, Grid(site, 1000.0, 5000.0, 4.0, 4.0, 20, 20))
