@@ -253,8 +253,7 @@ def warp_block(
     scratch = _scratch(last - first, pixels, resampling.real)
     bands, window_height, window_width = pixels.shape
     # Points within these bounds have all neighbours both in the source and in the window.
-    low_col = left + reach if left > 0 else reach
-    low_row = top + reach if top > 0 else reach
+    low_col, low_row = left + reach, top + reach
     high_col, high_row = left + window_width - reach - 1, top + window_height - reach - 1
     short = 0
     for row in range(target.first_row, target.last_row):
