@@ -14,6 +14,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.raster.stored_crs import stored_wkt
 from ortho_pipeline.raster.verified_writing import _fits, checked_options, require_writable
 
 TILES = {"TILED": "YES", "BLOCKXSIZE": "384", "BLOCKYSIZE": "384"}
@@ -127,3 +128,13 @@ def test_options_that_suit_the_pixels_are_accepted() -> None:
         ("GTiff", {"INTERLEAVE": "BAND", "COMPRESS": "ZSTD", "PREDICTOR": "2"}),
     ):  # fmt: skip
         require_writable(driver, checked_options(driver, chosen, 2), 3, gdal.GDT_Byte)
+
+
+def test_nothing_stays_in_the_memory_of_gdal(tmp_path: Path) -> None:
+    """Options and the CRS are tried with files there."""
+    for driver, wrong in (("GTiff", {"TILED": "YES", "BLOCKXSIZE": "100"}), ("COG", {"COMPRESS": "JPEG"})):
+        require_writable(driver, checked_options(driver, {}, 1), 1, gdal.GDT_Byte)
+        with pytest.raises(InputError):
+            require_writable(driver, wrong, 4, gdal.GDT_UInt16)
+    stored_wkt(Grid(pyproj.CRS("EPSG:32636"), 500_000.0, 4_100_000.0, 2.0, 2.0, 8, 8))
+    assert [name for name in gdal.ReadDir("/vsimem/") or () if name.startswith("ortho_")] == []

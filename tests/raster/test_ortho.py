@@ -11,9 +11,18 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.raster import ortho
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.pixel_types import gdal_type
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.raster.verified_writing import check_written, close, raster_output, require_whole
+from ortho_pipeline.raster.verified_writing import (
+    check_written,
+    close,
+    gdal_errors,
+    raster_output,
+    require_whole,
+    written,
+)
 
 GRID = Grid(parse_crs("EPSG:32633"), 500_000.0, 4_000_000.0, 1.0, 1.0, 700, 600)
 NOISE = np.random.default_rng(1).integers(0, 60_000, (1, 600, 700)).astype(np.uint16)
@@ -257,3 +266,133 @@ def test_statistics_overviews_and_masks_go_with_the_raster_that_is_replaced(tmp_
         dataset = None
         assert len([*tmp_path.iterdir()]) > 1
         (tmp_path / "a.tif.msk").write_bytes(b"")
+
+
+@pytest.mark.parametrize("band", [1, 2])
+def test_a_damaged_block_is_refused_in_any_band(tmp_path, band):
+    """Of bands that are stored apart each is read."""
+    path = write(tmp_path / "o.tif", "GTiff", {"INTERLEAVE": "BAND", "COMPRESS": "DEFLATE"})
+    check_written(path, path)
+    dataset, content = gdal.Open(str(path)), bytearray(path.read_bytes())
+    offset = int(dataset.GetRasterBand(band).GetMetadataItem("BLOCK_OFFSET_1_0", "TIFF"))
+    del dataset
+    content[offset : offset + 500] = bytes(500)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read back"):
+        check_written(path, path)
+
+
+def test_absent_blocks_are_refused_unless_a_raster_may_lack_some(tmp_path):
+    path = tmp_path / "o.tif"
+    options = ["TILED=YES", "SPARSE_OK=TRUE"]
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 700, 600, 1, gdal.GDT_Byte, options)
+    dataset.WriteRaster(0, 0, 256, 256, bytes([1]) * 256 * 256)
+    close(dataset)
+    check_written(path, path, sparse=True)
+    with pytest.raises(InputError, match="incomplete"):
+        check_written(path, path)
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "sparse"),
+    [(600, {}, False), (599, {}, True), (600, {"SPARSE_OK": "true"}, True), (600, {"SPARSE_OK": "NO"}, False)],
+)
+def test_blocks_may_be_absent_where_a_part_was_written_or_the_user_allows_it(
+    tmp_path, monkeypatch, rows, options, sparse
+):
+    asked = []
+    monkeypatch.setattr(ortho, "check_written", lambda *_, sparse, size: asked.append((sparse, size)))
+    profile = Profile(1, np.dtype(np.uint16), "nodata", 0.0)
+    with RasterWriter(tmp_path / "o.tif", GRID, profile, driver="GTiff", creation_options=options) as writer:
+        for left, right in ((0, 300), (300, 700)):
+            writer.write(left, 0, NOISE[:, :rows, left:right], None)
+    assert asked == [(sparse, (700, 600))]
+
+
+@pytest.mark.parametrize("before", [None, "NO"])
+def test_the_choice_of_a_program_where_masks_go_is_left_as_it_was(tmp_path, before):
+    """Also after an error. While this package writes, masks go into the file itself."""
+    option = "GDAL_TIFF_INTERNAL_MASK"
+    gdal.SetThreadLocalConfigOption(option, before)
+    try:
+        write(tmp_path / "o.tif", "GTiff", {})
+        assert gdal.GetThreadLocalConfigOption(option) == before
+        with pytest.raises(InputError, match="YES is not the reason"), gdal_errors(tmp_path / "o.tif"):
+            raise RuntimeError(f"{gdal.GetThreadLocalConfigOption(option)} is not the reason")
+        assert gdal.GetThreadLocalConfigOption(option) == before
+    finally:
+        gdal.SetThreadLocalConfigOption(option, None)
+
+
+@pytest.mark.parametrize("size", [(2500, 3), (3, 2500)])
+@pytest.mark.parametrize(("kind", "nodata"), [("u2", 7.0), ("f4", np.nan), ("u1", None)])
+def test_a_copy_of_a_raster_is_whole_and_its_valid_pixels_are_counted(tmp_path, size, kind, nodata):
+    """Longer than the windows of 2048 px. Without nodata the last band is the mask, of which 1 is enough."""
+    random, (width, height) = np.random.default_rng(3), size
+    pixels = random.integers(10, 99, (2, height, width)).astype(kind)
+    missing = random.random(pixels.shape) < 0.4
+    valid = ~missing.all(axis=0)
+    pixels[missing] = 0 if nodata is None else nodata
+    bands = pixels if nodata is not None else np.concatenate([pixels, valid[None].astype(kind)])
+    made = gdal.GetDriverByName("GTiff").Create(
+        str(tmp_path / "a.tif"), width, height, len(bands), gdal_type(pixels.dtype)
+    )
+    made.WriteArray(bands)
+    del made
+    grid = Grid(GRID.crs, GRID.left, GRID.top, 1.0, 1.0, width, height)
+    profile = Profile(2, pixels.dtype, "mask" if nodata is None else "nodata", nodata)
+    with RasterWriter(tmp_path / "o.tif", grid, profile, driver="GTiff") as writer:
+        assert writer.copy(tmp_path / "a.tif") == valid.sum()
+    found = gdal.Open(str(tmp_path / "o.tif"))
+    np.testing.assert_array_equal(found.ReadAsArray(), pixels)
+    if nodata is None:
+        np.testing.assert_array_equal(found.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0, valid)
+
+
+@pytest.mark.parametrize("driver", ["GTiff", "COG"])
+def test_each_band_has_its_name_scale_offset_and_unit_in_the_file(tmp_path, driver):
+    scales = ((0.01, -3.0, "m"), (1.0, 0.0, ""), (1.0, 0.5, "dB"), (4.0, 0.0, ""))
+    profile = Profile(4, np.dtype(np.uint16), "mask", descriptions=("a", "", "c", "d"), scales=scales)
+    grid = Grid(GRID.crs, GRID.left, GRID.top, 1.0, 1.0, 9, 8)
+    with RasterWriter(tmp_path / "o.tif", grid, profile, driver=driver) as writer:
+        writer.write(0, 0, np.ones((4, 8, 9), np.uint16), np.ones((8, 9), bool))
+    dataset = gdal.Open(str(tmp_path / "o.tif"))
+    bands = [dataset.GetRasterBand(number) for number in (1, 2, 3, 4)]
+    assert [band.GetDescription() for band in bands] == ["a", "", "c", "d"]
+    found = [(band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands]
+    assert found == list(scales)
+
+
+def test_of_many_blocks_the_last_in_the_file_is_read(tmp_path):
+    """What a disk that was full at the end leaves. Of 110 blocks, one in nine is read besides."""
+    path = write(tmp_path / "o.tif", "GTiff", {"COMPRESS": "DEFLATE", "BLOCKXSIZE": "64", "BLOCKYSIZE": "64"}, "nodata")
+    check_written(path, path)
+    dataset, content = gdal.Open(str(path)), bytearray(path.read_bytes())
+    band = dataset.GetRasterBand(1)
+    offsets = [int(band.GetMetadataItem(f"BLOCK_OFFSET_{k % 11}_{k // 11}", "TIFF")) for k in range(110)]
+    del band, dataset
+    assert offsets.index(max(offsets)) % 9
+    content[max(offsets) : max(offsets) + 500] = bytes(500)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read back"):
+        check_written(path, path)
+
+
+def test_a_raster_of_a_plugin_is_checked_and_takes_old_files_along(tmp_path):
+    """Statistics, overviews and masks of the raster that was there before. One that lacks blocks does not appear."""
+    path = tmp_path / "o.tif"
+    for ending in ("", ".aux.xml", ".ovr", ".msk"):
+        (tmp_path / f"o.tif{ending}").write_bytes(b"old")
+    options = ["TILED=YES", "SPARSE_OK=TRUE"]
+    with pytest.raises(InputError, match="incomplete"), raster_output(path) as temporary:
+        close(gdal.GetDriverByName("GTiff").Create(str(temporary), 300, 300, 1, gdal.GDT_Byte, options))
+    assert {one.read_bytes() for one in tmp_path.iterdir()} == {b"old"}
+    assert len([*tmp_path.iterdir()]) == 4
+    with raster_output(path) as temporary:
+        close(gdal.GetDriverByName("GTiff").Create(str(temporary), 20, 10, 1))
+    assert [one.name for one in tmp_path.iterdir()] == ["o.tif"]
+
+
+def test_a_dataset_that_gdal_did_not_make_is_an_error_before_it_is_used():
+    with pytest.raises(RuntimeError), written(None):
+        pytest.fail("there is nothing to write into")

@@ -80,3 +80,23 @@ def test_a_crs_that_no_file_gives_back_is_refused(tmp_path: Path, crs: str, lon:
         assert crs in str(refused)
         assert refused.field == "output.crs"
         assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+@pytest.mark.parametrize(("off", "stored"), [(0.08, True), (0.15, False), (1000.0, False)])
+def test_places_in_a_file_are_those_of_the_grid_to_a_hundredth_of_the_shorter_side_of_a_pixel(
+    monkeypatch: pytest.MonkeyPatch, way: tuple[int, int], off: float, stored: bool
+) -> None:
+    """The file gives back a false easting or northing that is off, to either side. Pixels are 20 x 10 m."""
+
+    def system(east: float, north: float) -> pyproj.CRS:
+        return pyproj.CRS(f"+proj=tmerc +lon_0=33 +x_0={5e5 + east:.3f} +y_0={north:.3f} +datum=WGS84 +type=crs")
+
+    monkeypatch.setattr(stored_crs, "same_crs", lambda one, other: False)
+    monkeypatch.setattr(stored_crs, "_given_back", lambda text: system(way[0] * off, way[1] * off))
+    grid = Grid(system(0.0, 0.0), 520_000.0, 4_100_000.0, 20.0, 10.0, 40, 30)
+    if stored:
+        assert "Transverse" in stored_crs.stored_wkt.__wrapped__(grid)
+    else:
+        with pytest.raises(CrsError, match="cannot store"):
+            stored_crs.stored_wkt.__wrapped__(grid)
