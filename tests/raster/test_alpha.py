@@ -138,3 +138,14 @@ def test_alpha_of_real_numbers_is_never_rounded(tmp_path, engine):
     else:
         ortho = rectified(tmp_path, "-b", "1,2,3")
         np.testing.assert_array_equal(ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0, pixels[3] > 0)
+
+
+@pytest.mark.parametrize(("width", "height"), [(300, 280), (20, 25)])
+def test_data_in_an_alpha_band_are_found_in_a_raster_of_any_size(tmp_path, width, height):
+    """Its first corner is empty, as that of an image that is turned on its map."""
+    pixels = np.random.default_rng(5).integers(1, 255, (4, height, width)).astype(np.uint8)
+    pixels[:, : height // 6, : width // 6] = 0
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), width, height, 4, options=["ALPHA=YES"])
+    made.WriteArray(pixels)
+    made.FlushCache()
+    assert [notice.fields for notice in doubtful_alpha(made)] == [{"band": 4}]

@@ -230,3 +230,17 @@ def test_a_truncated_file_whose_missing_pixels_gdal_reads_as_zeros_is_refused(
     path.write_bytes(path.read_bytes()[:-cut])
     with pytest.raises(InputError, match="the file is truncated"):
         open_seen(path, (), DRIVERS, siblings=True)
+
+
+@pytest.mark.parametrize(("bands", "size"), [(3, 64 * 32 * 3), (1, 64 * 32)])
+def test_a_mask_does_not_make_a_pixel_cost_less(tmp_path: Path, monkeypatch, bands: int, size: int) -> None:
+    monkeypatch.setenv("GDAL_TIFF_INTERNAL_MASK", "YES")
+    options = ["TILED=YES", "BLOCKXSIZE=64", "BLOCKYSIZE=32", "INTERLEAVE=PIXEL"]
+    path = tiff(tmp_path / "in.tif", *options, bands=bands, kind=gdal.GDT_Byte)
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
+    dataset.GetRasterBand(1).GetMaskBand().Fill(255)
+    del dataset
+    dataset, block = opened(path)
+    assert dataset.GetRasterBand(1).GetMaskFlags() == gdal.GMF_PER_DATASET
+    assert block == DecodedUnit(size, str(path))

@@ -148,7 +148,7 @@ def test_the_stretch_is_from_percentile_1_to_99() -> None:
     [
         # At least half of the content of the best, at most four, in the order of the file.
         ((4.0, 2.0, 1.99, 0.0, 3.0), (1, 2, 5)), ((5.0, 9.0, 4.6, 4.7, 4.8, 4.9), (1, 2, 5, 6)),
-        ((0.0, 0.0, 0.1), (3,)), ((2.0, 2.0, 2.0, 2.0, 2.0), (1, 2, 3, 4)),
+        ((0.0, 0.0, 0.1), (3,)), ((2.0, 2.0, 2.0, 2.0, 2.0), (1, 2, 3, 4)), ((3.0, 2.0), (1, 2)), ((0.5, 3.0), (2,)),
     ],
 )  # fmt: skip
 def test_bands_with_half_of_the_best_content_are_averaged(
@@ -218,3 +218,24 @@ def test_a_coarse_copy_is_of_overviews_where_there_are_some(tmp_path: Path) -> N
     dataset.BuildOverviews("AVERAGE", [2, 4, 8, 16])
     del dataset
     np.testing.assert_allclose(Pyramid(RasterSource(tmp_path / "a.tif"), (1, 2)).coarse, means, rtol=1e-4)
+
+
+def test_a_band_without_any_value_is_not_averaged(tmp_path: Path) -> None:
+    """It would leave no value in the mean."""
+    bands = np.stack([texture(1, 128, 128), np.full((128, 128), -9.0), texture(2, 128, 128)]).astype(np.float32)
+    view = Intensity(raster(tmp_path / "a.tif", bands, -9.0))
+    assert view.averaged == (1, 3)
+    assert np.isfinite(view.read(0, 0, 128, 128)).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "told"), [((100, 110, 1), (20, 30, 1), True), ((0, 192, 1), (0, 192, 25), False)]
+)
+def test_windows_with_gaps_do_not_tell_whether_a_raster_was_enlarged(tmp_path: Path, rows, columns, told) -> None:
+    """Enlarged by two in the spectrum. Gaps at one place leave whole windows; gaps in every 25th column leave none."""
+    pixels = np.random.default_rng(3).normal(size=(96, 96))
+    for axis in (0, 1):
+        pixels = np.fft.irfft(np.fft.rfft(pixels, axis=axis), 192, axis=axis)
+    assert Intensity(raster(tmp_path / "a.tif", pixels[None].astype(np.float32), -9.0)).enlarged
+    pixels[slice(*rows), slice(*columns)] = -9.0
+    assert Intensity(raster(tmp_path / "b.tif", pixels[None].astype(np.float32), -9.0)).enlarged is told

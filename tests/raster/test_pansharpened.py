@@ -28,7 +28,8 @@ def place(left: int, top: int, width: int, height: int, ratio: int = 1) -> Grid:
 
 
 def write(path: Path, grid: Grid, pixels: np.ndarray, nodata: float | None = None) -> Path:
-    kind = {"uint16": gdal.GDT_UInt16, "float32": gdal.GDT_Float32}[pixels.dtype.name]
+    kinds = {"uint16": gdal.GDT_UInt16, "uint32": gdal.GDT_UInt32, "float32": gdal.GDT_Float32}
+    kind = kinds[pixels.dtype.name]
     made = gdal.GetDriverByName("GTiff").Create(str(path), grid.width, grid.height, len(pixels), kind)
     made.SetGeoTransform(grid.geotransform)
     made.SetProjection(grid.crs.to_wkt())
@@ -274,3 +275,20 @@ def test_an_ortho_that_is_nowhere_on_the_map_of_the_other_has_nothing_in_common(
     site = pyproj.CRS('LOCAL_CS["a building site",UNIT["metre",1]]')
     with pytest.raises(InputError, match="do not overlap"):
         CommonExtent.of(pan, Grid(site, 1000.0, 5000.0, 4.0, 4.0, 20, 20))
+
+
+def test_a_pixel_whose_weighted_sum_is_zero_becomes_zero() -> None:
+    colours = np.array([[[0.0, 3.0, 200.0]], [[0.0, -1.0, 100.0]]])
+    found = brovey(np.array([[500.0, 500.0, 250.0]]), colours, (0.25, 0.75))
+    np.testing.assert_allclose(found, [[[0.0, 0.0, 400.0]], [[0.0, 0.0, 200.0]]])
+
+
+def test_large_numbers_keep_their_digits(tmp_path: Path) -> None:
+    """Beyond 2^24, beside an empty pixel: in single precision they would be even."""
+    sharp = 2**27 + np.arange(64 * 64, dtype=np.uint32).reshape(1, 64, 64)
+    sharp[0, 10, 20] = 7
+    wide = np.full((2, 16, 16), 3, np.uint32)
+    pan = write(tmp_path / "p.tif", place(0, 0, 64, 64), sharp, 7)
+    pixels, valid = opened(pan, write(tmp_path / "m.tif", place(0, 0, 16, 16, RATIO), wide, 9)).read(0, 0, 64, 64)
+    assert valid.sum() == 64 * 64 - 1
+    np.testing.assert_array_equal(pixels[:, valid], np.repeat(sharp[:, valid[None][0]], 2, axis=0))

@@ -9,7 +9,7 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster.pixel_types import holds, nodata_of, pixel_type, read_type
+from ortho_pipeline.raster.pixel_types import check_types, holds, nodata_of, pixel_type, read_type
 
 
 @pytest.mark.parametrize("name", ["u1", "i2", "u2", "i4", "u4"])
@@ -62,3 +62,12 @@ def test_types_have_the_names_of_gdal_whatever_their_case() -> None:
 )  # fmt: skip
 def test_a_conversion_reads_in_a_floating_type_that_loses_nothing(own: str, wanted: str | None, read: str) -> None:
     assert read_type(np.dtype(own), wanted) == np.dtype(read)
+
+
+def test_a_complex_band_among_others_is_refused() -> None:
+    dataset = gdal.GetDriverByName("MEM").Create("", 1, 1, 1, gdal.GDT_Byte)
+    dataset.AddBand(gdal.GDT_CFloat32)
+    bands = [dataset.GetRasterBand(number) for number in (1, 2)]
+    check_types(bands[:1], "a.tif")
+    with pytest.raises(InputError, match="complex pixels cannot be resampled"):
+        check_types(bands, "a.tif")

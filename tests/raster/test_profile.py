@@ -112,3 +112,25 @@ def test_classes_have_names_and_opaque_colours() -> None:
     assert made.interpretations == (gdal.GCI_PaletteIndex,)
     assert [made.color_table.GetColorEntry(value) for value in (1, 7)] == [(10, 20, 30, 255), (255, 128, 1, 255)]
     assert made.metadata == {"CLASS_1": "new", "CLASS_7": "old", "UNIT": "years"}
+
+
+def test_all_bands_but_alpha_have_colour() -> None:
+    kinds = (gdal.GCI_RedBand, gdal.GCI_AlphaBand, gdal.GCI_Undefined)
+    assert Profile(3, np.dtype("u1"), "mask", interpretations=kinds).colours == [0, 2]
+    assert Profile(3, np.dtype("u1"), "mask").colours == [0, 1, 2]
+
+
+def test_colour_tables_are_the_same_if_they_agree_in_the_colours_of_both() -> None:
+    """Some formats have 256 colours whatever is in use, others as many as there are."""
+
+    def shown(*colours: tuple[int, int, int, int]) -> Profile:
+        table = gdal.ColorTable()
+        for value, colour in enumerate(colours):
+            table.SetColorEntry(value, colour)
+        return Profile(1, np.dtype("u1"), "mask", color_table=table)
+
+    red, blue = (255, 0, 0, 255), (0, 0, 255, 255)
+    two, three = shown(red, blue), shown(red, blue, red)
+    assert two.unlike(three, "a", "b") == three.unlike(two, "a", "b") == ""
+    for other in (shown(red, red), shown(blue, blue), shown(red, red, red)):
+        assert two.unlike(other, "a", "b") == "b and a have different colour tables"

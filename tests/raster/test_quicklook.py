@@ -93,3 +93,15 @@ def test_larger_values_are_brighter_and_complex_ones_by_their_magnitude(tmp_path
     low, high = np.percentile(seen, (1, 99))
     grey = picture(preview_png(tmp_path / "a.tif"))[0]
     assert np.abs(grey - np.clip((seen - low) / (high - low), 0, 1) * 255).max() <= 1
+
+
+def test_a_picture_of_a_raster_with_overviews_shows_means(tmp_path: Path) -> None:
+    values = np.random.default_rng(5).uniform(0, 200, (64, 96)).astype(np.float32)
+    dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 96, 64, 1, gdal.GDT_Float32)
+    dataset.GetRasterBand(1).WriteArray(values)
+    dataset.BuildOverviews("AVERAGE", [2])
+    del dataset
+    means = values.reshape(16, 4, 24, 4).mean(axis=(1, 3))
+    low, high = np.percentile(means, (1, 99))
+    grey = picture(preview_png(tmp_path / "a.tif", side=24))[0]
+    assert np.abs(grey - np.clip((means - low) / (high - low), 0, 1) * 255).max() <= 1

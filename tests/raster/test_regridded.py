@@ -212,3 +212,46 @@ def test_a_file_that_refers_to_another_folder_is_read_where_that_is_allowed(orth
     pixels, valid = Regridded(tmp_path / "a.vrt", GRID, roots=(ortho.parent,)).read(0, 0, 60, 40)
     np.testing.assert_array_equal(np.where(valid, pixels, 0.0), np.where(valid, middles(GRID), 0.0))
     assert valid.sum() == 2 * 60 * 40 - 1
+
+
+@pytest.mark.parametrize("off", [0.0, 3.0])
+@pytest.mark.parametrize(
+    ("left", "top"), [(-7, 5), (-9, 5), (60, 5), (63, 5), (5, -6), (5, -9), (5, 40), (5, 44), (-9, -9), (63, 44)]
+)
+def test_a_window_beside_the_ortho_has_no_values(ortho: Path, off: float, left: int, top: int) -> None:
+    """7 x 6 pixels that touch it or are apart, on one axis or on both. They would be copied, or resampled."""
+    grid = Grid(GRID.crs, 500_000.0 + off, 4_000_000.0, 10.0, 20.0, 60, 40)
+    pixels, valid = Regridded(ortho, grid).read(left, top, 7, 6)
+    assert pixels.shape == valid.shape == (2, 6, 7)
+    assert not valid.any()
+
+
+def test_bounds_across_longitude_180_go_on_beyond_it() -> None:
+    to_map = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32660", always_xy=True)
+    x, y = to_map.transform(180.0, 10.0)
+    grid = Grid(parse_crs("EPSG:32660"), x - 4000.0, y + 3000.0, 100.0, 100.0, 100, 60)
+    corners = grid.xy(*np.meshgrid(np.linspace(0, 100, 23), np.linspace(0, 60, 23)))
+    lon, lat = to_map.transform(*corners, direction="INVERSE")
+    lon = np.mod(lon, 360.0)
+    wanted = (lon.min(), lat.min(), lon.max(), lat.max())
+    assert wanted[0] < 179.97
+    assert wanted[2] > 180.05
+    assert warped_bounds(grid, parse_crs("EPSG:4326")) == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize("turn", [35.0, 125.0, -125.0])
+def test_the_kernel_holds_the_box_of_a_pixel_that_is_turned(tmp_path: Path, turn: float) -> None:
+    """Maps whose norths differ by so many degrees, and more than a right angle."""
+    plane = pyproj.CRS(f"+proj=stere +lat_0=90 +lat_ts=70 +lon_0={15 - turn} +datum=WGS84 +type=crs")
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", plane, always_xy=True).transform(15.0, 75.0)
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 80, 80, 1)
+    made.SetProjection(plane.to_wkt())
+    made.SetGeoTransform((x - 400.0, 10.0, 0.0, y + 400.0, 0.0, -10.0))
+    del made
+    left, top = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32633", always_xy=True).transform(15.0, 75.0)
+    grid = Grid(parse_crs("EPSG:32633"), left - 60.0, top + 50.0, 40.0, 25.0, 3, 4)
+    corners = grid.xy(1.5 + np.array([-0.5, 0.5, 0.5, -0.5]), 2.0 + np.array([-0.5, -0.5, 0.5, 0.5]))
+    place = pyproj.Transformer.from_crs(grid.crs, plane, always_xy=True).transform(*corners)
+    wide, high = (np.ptp(part) / 10.0 for part in place)
+    assert min(wide, high) > 2
+    np.testing.assert_allclose(Regridded(tmp_path / "a.tif", grid)._scales(), (1 / wide, 1 / high), rtol=1e-4)

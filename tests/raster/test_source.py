@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import zipfile
+
 import numpy as np
 import pytest
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile
-from ortho_pipeline.raster.source import RasterSource, open_dataset
+from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.raster.regridded import grid_of
+from ortho_pipeline.raster.source import RasterSource, open_dataset, open_pixels
 
 
 def test_a_folder_without_a_product_is_no_image(tmp_path):
@@ -144,3 +148,40 @@ def test_a_larger_block_is_refused_with_its_size(tmp_path):
 def test_a_name_that_is_too_long_for_the_system_is_named_as_the_cause() -> None:
     with pytest.raises(InputError, match=r"cannot be read \(File name too long\)"):
         RasterSource("x" * 300)
+
+
+@pytest.mark.parametrize("opened", [open_dataset, open_pixels, RasterSource, preview_png, grid_of])
+def test_rasters_of_other_machines_are_not_opened_unless_that_is_allowed(opened):
+    with pytest.raises(InputError, match="network access is off by default"):
+        opened("https://example.invalid/a.tif")
+
+
+def test_a_palette_of_any_band_or_file_counts(tmp_path):
+    """Its indices must not be mixed, whatever is next to them."""
+    plain = raster(tmp_path / "a.tif", count=1)
+    dataset = gdal.Open(raster(tmp_path / "b.tif", count=1), gdal.GA_Update)
+    colours = gdal.ColorTable()
+    colours.SetColorEntry(11, (200, 100, 50))
+    dataset.GetRasterBand(1).SetColorTable(colours)
+    dataset = None
+    assert not RasterSource(plain).palette
+    for names in ((plain, tmp_path / "b.tif"), (tmp_path / "b.tif", plain)):
+        assert RasterSource(*names).palette
+        assert not RasterSource(*names, bands=[1 + (names[0] != plain)]).palette
+    gdal.BuildVRT(str(tmp_path / "c.vrt"), [plain, str(tmp_path / "b.tif")], separate=True)
+    both = gdal.Open(str(tmp_path / "c.vrt"), gdal.GA_Update)
+    both.GetRasterBand(2).SetColorTable(colours)
+    both = None
+    assert RasterSource(tmp_path / "c.vrt").palette
+
+
+def test_a_vrt_in_an_archive_is_not_opened(tmp_path):
+    """What it refers to cannot be seen to there; an image in the same archive is read."""
+    raster(tmp_path / "a.tif")
+    gdal.Translate(str(tmp_path / "a.vrt"), str(tmp_path / "a.tif"), format="VRT").FlushCache()
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for name in ("a.tif", "a.vrt"):
+            archive.write(tmp_path / name, name)
+    assert RasterSource(f"/vsizip/{tmp_path}/a.zip/a.tif").width == 3
+    with pytest.raises(InputError, match="GDAL cannot open this"):
+        RasterSource(f"/vsizip/{tmp_path}/a.zip/a.vrt")

@@ -151,3 +151,10 @@ def test_the_faintest_pixels_are_valid(tmp_path: Path) -> None:
     dataset.WriteArray(np.array([[[9] * 3] * 2, [[1, 1, 0]] * 2], dtype=np.uint8))
     dataset = None
     assert valid_outline(tmp_path / "a.tif").bounds == (500_000, 3_999_960, 500_020, 4_000_000)
+
+
+def test_a_slanted_edge_has_no_stairs(tmp_path: Path) -> None:
+    valid = np.tri(60, dtype=bool)
+    outline = valid_outline(raster(tmp_path / "a.tif", valid))
+    assert len(shapely.get_coordinates(outline)) < 10
+    assert outline.area == pytest.approx(valid.sum() * 200, rel=0.05)
