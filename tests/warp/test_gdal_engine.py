@@ -33,7 +33,7 @@ from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.warp.engines import engine_of
 from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
-from ortho_pipeline.warp.job import WarpJob, WarpRecord
+from ortho_pipeline.warp.job import WARPING, WarpJob, WarpRecord
 from ortho_pipeline.warp.quality.hiding import Hiding
 
 UTM = pyproj.CRS.from_epsg(32651)
@@ -132,6 +132,10 @@ def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple
         found.append((dataset.ReadAsArray(), dataset.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0))
     assert 0.0 <= theirs.seconds < 3600.0  # a duration, not a time
     (one, valid), (other, their_valid) = found
+    assert ours.pixels == theirs.pixels == valid.size
+    assert (ours.valid_pixels, theirs.valid_pixels) == (valid.sum(), their_valid.sum())
+    # Every pixel is projected: there is no lattice.
+    assert (theirs.finest_spacing, theirs.refined_blocks, theirs.blocks) == (1, 0, 0)
     use = valid & their_valid
     assert use.mean() > 0.3
     difference = float(np.abs(one - other)[:, use].max())
@@ -263,3 +267,22 @@ def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path)
     assert "about 1000 MB" in arrays.notes(512_000_000)[0]
     assert not arrays.notes(1_000_000_000)
     assert not arrays.replaced(transformer="RPC").notes(512_000_000)
+
+
+def test_gdals_warper_reports_its_progress(tmp_path):
+    told = []
+    progress = Resources(threads=1, progress=lambda stage, share: told.append((stage, share)))
+    both(fitted("affine2d"), FlatSurface(80.0), tmp_path, resources=progress)
+    assert {stage for stage, _ in told} == {WARPING}
+    shares = {share for _, share in told}
+    assert len(shares) > 2
+    # Parts of the ortho that do not see the image count for nothing in GDAL.
+    assert 0.0 <= min(shares) < 0.5 < max(shares) <= 1.0
+
+
+def test_gdals_own_transformer_stands_for_an_rpc(tmp_path):
+    model = export_rpc(frame()).rpc
+    _, apart, result = both(model, FlatSurface(80.0), tmp_path)
+    assert result.transformer == "RPC"
+    assert result.max_error_px < 1e-4
+    assert apart < 1e-3

@@ -122,3 +122,32 @@ def test_tiles_come_in_their_order_and_each_is_made_once(count: int, ahead: int)
     found = list(_in_order(2, work, tiles, ahead))
     assert found == [(tile, tile if ahead else None) for tile in tiles]
     assert sorted(prepared) == (tiles if ahead else [])
+
+
+def test_blocks_that_are_read_together_have_the_reach_of_the_one_that_reads_farthest() -> None:
+    made, asked = maker(window_bytes=10**6), []
+    made._window = lambda *window: asked.append(window)
+    made._warp_block = lambda block, window, dem, target: None
+    blocks = [
+        OutputBlock(0, 0, window=(10, 40, 60, 70), reach=2), OutputBlock(0, 1, window=(50, 20, 95, 55), reach=7),
+        OutputBlock(0, 2, window=(60, 30, 90, 50), reach=4),
+    ]  # fmt: skip
+    made._warp(blocks, None, (0, 256, 0, 256), SimpleNamespace(target=lambda block, area: None))
+    assert asked == [(10, 20, 95, 70, 7)]
+
+
+@pytest.mark.parametrize(
+    ("area", "count"),
+    [((0, 256, 0, 256), 15), ((64, 128, 128, 192), 1), ((0, 64, 192, 256), 0), ((192, 256, 0, 64), 1)],
+)
+def test_cells_of_a_block_are_made_where_its_heights_are_and_the_image_is(area: Any, count: int) -> None:
+    """The cell in the upper right does not see the image."""
+    made, cells = maker(), []
+    made.lattices.source_window = lambda block, rows, columns: (
+        None if (rows.start, columns.start) == (0, 3) else (0, 0, 9, 9)
+    )
+    made._warp_block = lambda block, window, dem, target: cells.append(target)
+    block = OutputBlock(0, 0, spacing=64)
+    made._warp_cells(block, None, area, SimpleNamespace(target=lambda block, cell: cell))
+    assert len(cells) == len(set(cells)) == count
+    assert all(area[k] <= cell[k] < cell[k + 1] <= area[k + 1] for cell in cells for k in (0, 2))

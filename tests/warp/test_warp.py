@@ -431,6 +431,16 @@ def test_output_does_not_depend_on_the_size_of_the_tiles(scene, tmp_path, monkey
     np.testing.assert_array_equal(*pixels)
 
 
+def test_the_progress_is_the_share_of_the_tiles_that_are_made(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(warp, "TILE", 256)
+    told = []
+    resources = Resources(threads=2, progress=lambda stage, share: told.append(share))
+    source = RasterSource(scene.write(texture()))
+    rectify(scene.model, source, FlatSurface(700.0), grid_of(), tmp_path / "o.tif", driver="GTiff", resources=resources)
+    # 760 x 760 pixels.
+    np.testing.assert_allclose(told, np.arange(1, 10) / 9)
+
+
 def test_adjacent_grids_meet_without_a_seam(scene, tmp_path):
     """Two halves of a grid, cut at a block, hold the pixels of the whole."""
     source, surface, whole = RasterSource(scene.write(texture(np.float32))), scene.surface(), grid_of()
