@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 from osgeo import gdal, osr
 
@@ -89,6 +90,7 @@ def test_the_most_accurate_needs_the_accuracy_of_all(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"left": 0.03}, "off the grid"), ({"top": 0.05}, "off the grid"), ({"step": (2.001, 3.0)}, "2.001 x 3"),
+        ({"left": -0.03}, "off the grid"), ({"top": -0.05}, "off the grid"),
         ({"step": (2.0, 3.001)}, "2 x 3.001"), ({"crs": 32634}, "zone 34N"), ({"bands": 2}, "2 bands"),
         ({"kind": gdal.GDT_UInt16}, "uint16"), ({"nodata": 0.0}, "by the nodata value 0, but a.tif by"),
     ],
@@ -129,3 +131,13 @@ def test_the_accuracy_of_a_pixel_is_that_of_the_pixel_above_it(tmp_path: Path) -
                 expected = errors[(top + row) // 2, (left + column) // 3]
                 worst = np.finfo(np.float32).max
                 assert found[row, column] == (worst if np.isnan(expected) else expected)
+
+
+def test_the_remedy_has_no_command_where_the_first_crs_has_no_code(tmp_path: Path) -> None:
+    made = ortho(tmp_path / "a.tif", 0.0, 0.0)
+    dataset = gdal.Open(str(made.path), gdal.GA_Update)
+    dataset.SetProjection(pyproj.CRS("+proj=tmerc +lon_0=15.5 +x_0=5e5 +ellps=GRS80 +units=m").to_wkt())
+    del dataset
+    with pytest.raises(InputError, match="zone 33N") as refused:
+        lay_out([made, ortho(tmp_path / "b.tif", 0.0, 0.0)], "first-on-top")
+    assert str(refused.value.remedy) == "rectify its scene again with the CRS, pixel size and grid of 'a.tif'"

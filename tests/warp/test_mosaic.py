@@ -173,17 +173,20 @@ def test_the_command_for_another_grid_does_not_mix_palette_indices(tmp_path):
         assert f" -r {kernel} " in str(caught.value.remedy)
 
 
-@pytest.mark.parametrize("resampling", ["nearest", "bilinear"])
-def test_overviews_of_classes_have_classes(tmp_path, resampling):
+@pytest.mark.parametrize(
+    ("kernels", "apart"), [(("nearest", "nearest"), True), (("nearest", "bilinear"), False), (("nearest", None), False)]
+)
+def test_overviews_of_classes_have_classes(tmp_path, kernels, apart):
     """With the default of GDAL (cubic), classes 1 and 8 had values from 1 to 9."""
     grid = Grid(UTM, 500000.0, 4e6, 2.0, 2.0, 600, 520)
     classes = (np.random.default_rng(0).integers(0, 2, (1, 520, 600)) * 7 + 1).astype(np.uint8)
     with RasterWriter(tmp_path / "a.tif", grid, Profile(1, np.dtype("uint8"), "nodata", 0.0), driver="GTiff") as writer:
         writer.write(0, 0, classes, None)
-    write_cog(lay_out([Ortho("a", tmp_path / "a.tif", resampling=resampling)]), tmp_path / "m.tif")
+    orthos = [Ortho(name, tmp_path / "a.tif", resampling=kernel) for name, kernel in zip("ab", kernels, strict=True)]
+    write_cog(lay_out(orthos), tmp_path / "m.tif")
     mosaic = open_dataset(tmp_path / "m.tif")
     overview = mosaic.GetRasterBand(1).GetOverview(0).ReadAsArray()
-    assert (set(np.unique(overview)) == {1, 8}) == (resampling == "nearest")
+    assert (set(np.unique(overview)) == {1, 8}) is apart
 
 
 def test_orthos_of_oblong_pixels_lie_where_their_corners_are(tmp_path):
@@ -220,13 +223,15 @@ def test_boxes_that_only_touch_have_nothing_in_common(other, common):
 
 def test_the_figures_of_a_seam_are_by_their_definitions(tmp_path, landscape, monkeypatch):
     a, b = (cut(tmp_path, name, landscape, 60 * k, 0, 120, 120) for k, name in enumerate("ab"))
-    monkeypatch.setattr(
-        inspect.getmodule(measure_seam), "_shifts", lambda *_: np.array([[3.0, 4.0], [0.0, 1.0], [0.0, 0.0]])
-    )
+    module, shifts = inspect.getmodule(measure_seam), np.array([[3.0, 4.0], [0.0, 1.0], [0.0, 0.0]])
+    monkeypatch.setattr(module, "_shifts", lambda *_: shifts)
     (pair,) = overlaps(lay_out([a, b], "first-on-top"))
     seam = measure_seam(pair)
     assert (seam["patches"], seam["median_px"], seam["largest_px"]) == (3, [0.0, 1.0], 5.0)
     assert seam["rmse_px"] == pytest.approx(math.sqrt(26 / 3))
+    monkeypatch.setattr(module, "_shifts", lambda *_: shifts[:1])
+    one = measure_seam(pair)
+    assert (one["patches"], one["median_px"], one["rmse_px"], one["largest_px"]) == (1, [3.0, 4.0], 5.0, 5.0)
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(0.0, 0.0), (0.4, -0.25), (3.3, 1.6), (-9.0, 14.5)])
@@ -238,7 +243,8 @@ def test_a_seam_is_the_shift_of_the_content(tmp_path, landscape, columns, rows):
     # The slanted corners are missing from an overlap of 350 x 300.
     assert pair.pixels == pytest.approx(350 * 300 - 60 * 60 / 2, rel=0.02)
     seam = measure_seam(pair)
-    assert seam["patches"] >= 5
+    # Of 128 px every 64 px, as many as fit.
+    assert 5 <= seam["patches"] <= (350 // 64) * (300 // 64)
     # The correlation finds hundredths of a pixel; shifts of half a pixel are pulled back by a few of them.
     assert seam["median_px"] == pytest.approx([columns, rows], abs=0.05)
     assert seam["rmse_px"] == pytest.approx(math.hypot(columns, rows), abs=0.08)
@@ -399,3 +405,38 @@ def test_a_raster_in_another_crs_is_refused_with_what_it_probably_is(tmp_path, c
     done = CliRunner().invoke(cli, ["mosaic", *paths, "-o", str(tmp_path / "m.tif"), "--order", "first-on-top"])
     assert done.exit_code == 2
     assert remedy in " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("lost", ["b", "pixels"])
+def test_a_vrt_that_lacks_an_ortho_or_pixels_is_refused(tmp_path, landscape, monkeypatch, lost):
+    """GDAL leaves out what it cannot use, with a warning."""
+    a, b = (cut(tmp_path, name, landscape, 60 * k, 0, 120, 120) for k, name in enumerate("ab"))
+    build = gdal.BuildVRT
+
+    def built(path, names, **more):
+        if lost == "b":
+            return build(path, [name for name in names if name != str(b.path)], **more)
+        left, bottom, right, top = more.pop("outputBounds")
+        return build(path, names, outputBounds=(left, bottom + 2.0, right, top), **more)
+
+    monkeypatch.setattr(writing.gdal, "BuildVRT", built)
+    with pytest.raises(InputError, match=f"would lose {lost}"):
+        write_vrt(lay_out([a, b], "first-on-top"), tmp_path / "m.vrt")
+    assert not (tmp_path / "m.vrt").exists()
+
+
+def test_the_edge_of_the_values_is_not_taken_for_content(tmp_path, landscape):
+    """Both orthos are empty in the same half of the overlap; the content of the second is displaced."""
+    moved = shift(landscape, (-3.0, 4.0), order=3, mode="reflect")
+    orthos = []
+    for name, picture in (("a", landscape), ("b", moved)):
+        values = np.where(np.arange(400) < 200, 0, picture[100:500, 100:500])
+        grid = Grid(UTM, 500000.0, 4e6, 2.0, 2.0, 400, 400)
+        with RasterWriter(tmp_path / f"{name}.tif", grid, Profile(1, np.dtype("uint16"), "nodata", 0.0)) as writer:
+            writer.write(0, 0, values.astype(np.uint16)[None], None)
+        orthos.append(Ortho(name, tmp_path / f"{name}.tif"))
+    (pair,) = overlaps(lay_out(orthos, "first-on-top"))
+    seam = measure_seam(pair)
+    assert seam["patches"] >= 4
+    assert seam["median_px"] == pytest.approx([4.0, -3.0], abs=0.05)
+    assert (seam["rmse_px"], seam["largest_px"]) == (pytest.approx(5.0, abs=0.1), pytest.approx(5.0, abs=0.3))

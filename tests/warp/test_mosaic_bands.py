@@ -96,6 +96,24 @@ def test_the_mosaic_keeps_names_and_units_and_fills_nan(tmp_path, write_mosaic):
     assert [(band.GetDescription(), band.GetUnitType()) for band in bands] == [("", ""), ("nir", "dB")]
 
 
+def test_a_vrt_of_orthos_whose_pixels_are_all_valid_has_no_empty_pixel(tmp_path):
+    """Of integers, of which 0 is one."""
+    orthos = []
+    for name, left in LEFT.items():
+        made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / f"{name}.tif"), 80, 60, 1, gdal.GDT_Byte)
+        made.SetProjection(UTM.to_wkt())
+        made.SetGeoTransform((5e5 + 2.0 * left, 2.0, 0.0, 4e6, 0.0, -2.0))
+        made.GetRasterBand(1).WriteArray(GROUND[0, :, left : left + 80] % 5)
+        del made
+        orthos.append(Ortho(name, tmp_path / f"{name}.tif"))
+    write_vrt(lay_out(orthos, "first-on-top"), tmp_path / "m.vrt")
+    mosaic = gdal.Open(str(tmp_path / "m.vrt"))
+    assert mosaic.GetRasterBand(1).GetNoDataValue() is None
+    values, valid = read(tmp_path / "m.vrt")
+    assert valid.all()
+    np.testing.assert_array_equal(values, GROUND[0] % 5)
+
+
 # -- bands that tell nothing -----------------------------------------------------------------------------------------
 
 

@@ -369,8 +369,10 @@ def test_the_figures_along_a_straight_seam_are_by_their_definitions(tmp_path, mo
     assert (seam["difference"], seam["rms"], seam["largest_rms"]) == ([-30.0], [30.0], [30.0])
     assert (seam["matched"], seam["median_px"], seam["largest_px"]) == (3, [0.0, 1.0], 5.0)
     assert seam["rmse_px"] == pytest.approx(math.sqrt(26 / 3))
+    monkeypatch.setattr(seams, "_shifts", lambda *_: np.array([[3.0, 4.0]]))
     alike = Balance(np.ones((2, 1)), np.array([[0.0], [-30.0]]), np.zeros(1), np.zeros(1), 0, 0.0)
     (seam,) = along_seams(placed, labels, cell, alike).values()
+    assert (seam["matched"], seam["median_px"], seam["rmse_px"], seam["largest_px"]) == (1, [3.0, 4.0], 5.0, 5.0)
     assert (seam["difference"], seam["rms"]) == ([0.0], [0.0])
 
 
@@ -462,7 +464,10 @@ def test_what_cannot_be_is_refused(tmp_path):
 
 
 def test_the_accuracy_of_a_pixel_is_that_at_its_place_in_its_own_ortho(tmp_path, monkeypatch):
-    """The second ortho begins 30 px right of the first and 10 px below; it is better in its first 20 columns."""
+    """The second ortho begins 30 px right of the first and 10 px below; it is better in its first 20 columns.
+
+    Where both are equally accurate, the first has the pixel.
+    """
     placed = []
     for number, (left, top) in enumerate([(0, 0), (30, 10)]):
         name = "ab"[number]
@@ -472,6 +477,7 @@ def test_the_accuracy_of_a_pixel_is_that_at_its_place_in_its_own_ortho(tmp_path,
         if number:
             errors[:] = 3.0
             errors[:25, :20] = 1.0
+            errors[25:28] = 2.0  # equal ones
         with RasterWriter(path, grid, Profile(1, np.dtype("float32"), "nodata", math.nan), driver="GTiff") as writer:
             writer.write(0, 0, errors[None], None)
         placed.append(dataclasses.replace(ortho, accuracy=path))
