@@ -299,3 +299,12 @@ def test_nodes_are_as_far_apart_as_half_a_per_cent_of_the_largest_sigma_allows(t
         (int(side), int(side)), (FLOOR, FLOOR), 1 << 28,
     )  # fmt: skip
     assert layer.spacing == spacing
+
+
+def test_what_a_vendor_states_counts_only_of_a_model_that_was_not_adjusted():
+    assert Budget(stated=3.0, reference=4.0).even == 25.0
+    assert Budget(covariance=np.eye(2), stated=3.0, reference=4.0).even == 16.0
+    assert Budget(heights=5.0, datum=1.0).even == 0.0
+    assert [one.knows_model for one in (Budget(), Budget(heights=5.0), Budget(stated=3.0), Budget(np.eye(2)))] == [
+        False, False, True, True,
+    ]  # fmt: skip

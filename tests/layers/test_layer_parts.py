@@ -156,3 +156,12 @@ def test_bands_are_rounded_to_one_part_in_two_thousand():
 
 def test_three_of_a_covariance():
     np.testing.assert_array_equal(accuracy._three(np.array([[[1.0, 2.0], [2.0, 5.0]]])), [[1.0, 5.0, 2.0]])
+
+
+@pytest.mark.parametrize(("size", "some"), [((1024, 1024), False), ((1025, 3), True), ((3, 1025), True)])
+def test_a_layer_with_a_side_of_more_than_1024_pixels_has_overviews(size, some):
+    """They do not mix pixels: a mean of directions or correlations is none."""
+    options = accuracy.overviews(Grid(None, 0, 0, 1, 1, *size))
+    assert (options.get("OVERVIEWS"), options.get("OVERVIEW_RESAMPLING")) == (
+        (None, "NEAREST") if some else ("NONE", None)
+    )
