@@ -66,11 +66,14 @@ class CommonExtent:
         xmin, ymin, xmax, ymax = warped_bounds(colours, pan.crs)
         left, right = (xmin - pan.left) / pan.dx, (xmax - pan.left) / pan.dx
         top, bottom = (pan.top - ymax) / pan.dy, (pan.top - ymin) / pan.dy
-        # What is nowhere in this CRS has infinite sides.
-        first, last = math.ceil(_clamped(left - _SAME, pan.width)), math.floor(_clamped(right + _SAME, pan.width))
-        upper, lower = math.ceil(_clamped(top - _SAME, pan.height)), math.floor(_clamped(bottom + _SAME, pan.height))
+        apart = InputError("the panchromatic and the multispectral ortho do not overlap")
+        # What has no place in this CRS has infinite bounds.
+        if not all(map(math.isfinite, (left, right, top, bottom))):
+            raise apart
+        first, last = max(0, math.ceil(left - _SAME)), min(pan.width, math.floor(right + _SAME))
+        upper, lower = max(0, math.ceil(top - _SAME)), min(pan.height, math.floor(bottom + _SAME))
         if not (first < last and upper < lower):
-            raise InputError("the panchromatic and the multispectral ortho do not overlap")
+            raise apart
         grid = part_of(pan, first, upper, last - first, lower - upper)
         ratio = _nesting(pan, colours, left, top)
         if not ratio:
@@ -78,11 +81,6 @@ class CommonExtent:
         across = _widened(first, last, round(left), round(right), ratio)
         down = _widened(upper, lower, round(top), round(bottom), ratio)
         return cls(grid, part_of(pan, across[0], down[0], across[1] - across[0], down[1] - down[0]), ratio)
-
-
-def _clamped(place: float, count: int) -> float:
-    """Return the nearest place within so many pixels."""
-    return min(max(place, 0.0), count)
 
 
 def _widened(first: int, last: int, begin: int, end: int, ratio: int) -> tuple[int, int]:
