@@ -47,9 +47,9 @@ def parts_of(cells: Cells, left: Left, still: NDArray[np.bool_], design: Array) 
         known, shift, of_edges = _displacement(left, date, still)
         variance = (left.scale[date] * left.shared + of_edges) * left.noisier
         far = known & (np.hypot(*shift.T) > _LEAST) & ((shift**2).sum(axis=1) > limit * variance)
-        # A large part makes the date noisy, so that none of its cells is beyond the limit.
+        # The correction of the date is between two large parts: either may be beyond the limit, or both, or none.
         half = _smaller_part(known, shift, design)
-        far |= half
+        far = half if half.any() else far
         area = ndimage.label(far.reshape(cells.shape[::-1]), NEXT)[0].ravel()
         part = far & (np.bincount(area)[area] >= AREA)
         if part.any():
