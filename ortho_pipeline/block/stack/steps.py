@@ -36,7 +36,7 @@ def steps_of(value: Array, covariance: Array) -> list[DateStep]:
     if len(value) < 2 * _FEWEST:
         return []
     scatter = (1.4826 * np.median(np.abs(np.diff(value, axis=0)), axis=0)) ** 2 / 2
-    freedom = 2 * max(_WORTH * (len(value) - 1), 2.0)
+    freedom = 2 * _WORTH * (len(value) - 1)
     found: list[DateStep] = []
     segments = [(0, len(value))]
     while segments:
