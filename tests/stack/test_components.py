@@ -180,6 +180,18 @@ def test_components_grow_with_the_square_of_the_errors() -> None:
     np.testing.assert_array_equal(one.constant, 0.0)
 
 
+def test_the_size_of_an_edge_does_not_change_what_parts_its_errors_have() -> None:
+    """An edge of large errors, as under a cloud, has a large factor. It does not decide what neighbours share."""
+    edges, trends = made()
+    before = components_of(edges, trends, PLACE, 4)
+    found = components_of(
+        edges, dataclasses.replace(trends, residual=trends.residual * np.array([1, 30, 1, 1])[:, None, None]), PLACE, 4
+    )
+    parts = [np.hstack([one.shared, one.own]) for one in (before, found)]
+    assert (parts[0] > 0).sum() > 2
+    np.testing.assert_allclose(parts[1] / parts[1].sum(), parts[0] / parts[0].sum(), rtol=1e-6, atol=1e-12)
+
+
 def test_components_explain_the_typical_residual() -> None:
     """What they make of a residual, both dates and the edge, is its mean square of the median edge."""
     edges, trends = made()

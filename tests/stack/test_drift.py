@@ -9,7 +9,7 @@ import pytest
 from networks import Made, Truth
 
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
-from ortho_pipeline.block.stack.common_changes import CommonChanges
+from ortho_pipeline.block.stack.common_changes import CommonChanges, Drift
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.moving import Motion
 from ortho_pipeline.block.stack.network import Network
@@ -118,6 +118,16 @@ def test_an_old_pair_without_a_link_changes_nothing() -> None:
     one = adjust(CELLS, edges, years, 10)
     other = adjust(CELLS, more, [*years, made.years[0] - 10.0, made.years[0] - 10.1], 10)
     np.testing.assert_allclose(one.network.value[:10, 0], other.network.value[:10, 0], atol=0.002)
+
+
+def test_rates_of_ground_are_relative_to_stable_ground_whose_rate_is_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their variance has that of the drift, along each axis."""
+    made, found = Truth(seed=4, dates=8).made(), list[np.ndarray]()
+    for variance in (np.zeros(2), np.array([4e-4, 9e-4])):
+        drift = Drift(np.zeros(2), variance, np.zeros(8))
+        monkeypatch.setattr(CommonChanges, "drift", lambda *given, drift=drift: drift)
+        found.append(adjust(CELLS, made.edges, made.years.tolist(), affine=False).motion.sigma)
+    np.testing.assert_allclose(found[1] ** 2 - found[0] ** 2, np.tile([4e-4, 9e-4], (144, 1)), rtol=1e-6)
 
 
 def test_an_area_of_four_cells_touches_its_neighbours() -> None:

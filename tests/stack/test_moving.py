@@ -238,11 +238,11 @@ def test_an_area_without_inner_cells_has_the_rate_of_its_fastest_cell() -> None:
     cells = Cells(np.zeros(2), 10.0, (5, 4))
     share, spread = np.zeros((4, 5)), np.full((4, 5), 0.01)
     share[1:3, 1:4] = [[0.15, 0.8, 0.2], [0.3, 0.6, 0.9]]
-    spread[2, 2], spread[2, 3] = 0.001, 0.2
+    spread[1, 2], spread[2, 2], spread[2, 3] = 0.06, 0.001, 0.2
     rate, sigma = share.ravel()[:, None] * [0.6, -0.8], spread.ravel()[:, None] * [1.0, 1.0]
     ratio = (share / spread).ravel() ** 2
     motion = Motion(share.ravel() > 0, np.ones(20, dtype=bool), rate, sigma, ratio, np.full(20, "steady"))
     found, of_found, square = motion.typical(motion.areas(cells)[0], cells)
     np.testing.assert_allclose(found, [0.48, -0.64])
     # What a row states belongs together: the rate is so many sigmas.
-    assert np.hypot(*found) / of_found == pytest.approx(np.sqrt(square)) == pytest.approx(80.0)
+    assert np.hypot(*found) / of_found == pytest.approx(np.sqrt(square)) == pytest.approx(0.8 / 0.06)

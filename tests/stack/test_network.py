@@ -128,12 +128,13 @@ def test_a_cloud_at_one_date_is_not_motion():
     assert not stack.motion.moving[[40, 70, 100]].any()
 
 
-def test_a_part_of_one_date_that_is_displaced_is_not_motion():
+@pytest.mark.parametrize("date", [3, 7, 12])
+def test_a_part_of_one_date_that_is_displaced_is_not_motion(date):
     """Half of the edges across a step are those of one date next to it."""
     made = Truth(seed=30, dates=16, interval=30.0, hidden=0.0).made()
     part = made.truth.cells.place[:, 0] < -0.6
     away = 3.0 * part[:, None]
-    value = made.edges.value + away * ((made.edges.first == 7) * 1.0 - (made.edges.second == 7))[:, None, None]
+    value = made.edges.value + away * ((made.edges.first == date) * 1.0 - (made.edges.second == date))[:, None, None]
     stack = adjust(made.truth.cells, dataclasses.replace(made.edges, value=value), made.years.tolist())
     assert part.sum() >= 20
     assert not stack.motion.moving[part].any()
@@ -152,6 +153,17 @@ def test_a_date_as_datum_keeps_its_place():
     np.testing.assert_allclose(stack.sigma[3], 0.0, atol=1e-9)
     np.testing.assert_allclose(stack.network.value[:, 0], made.shift - made.shift[3], atol=0.2)
     np.testing.assert_allclose(stack.sigma_between(1, 3), stack.sigma[1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("sloped", [False, True])
+def test_dates_have_slopes_relative_to_the_datum(sloped):
+    """Relative to a date with slopes all other dates have some; relative to another one, those that have some."""
+    made = Truth(seed=4, dates=16, sloped=3).made()
+    steep = np.abs(made.slopes).max(axis=(1, 2)) > 0
+    datum = int(np.flatnonzero(steep == sloped)[1])
+    stack = adjust(made.truth.cells, made.edges, made.years.tolist(), datum=datum)
+    np.testing.assert_array_equal(stack.sloped, steep | sloped)
+    np.testing.assert_allclose(stack.network.value[:, 1:], made.slopes - made.slopes[datum], atol=0.2)
 
 
 def test_a_date_without_pairs_is_not_determined():
@@ -256,6 +268,11 @@ def test_sigmas_have_what_dates_of_one_season_share(of_season):
     assert 0.8 < spread(stacks) < 1.3
 
 
+def alternating(sine: float) -> np.ndarray:
+    """Return two days in each of six years at which the sine of a year is as large, before and after its middle."""
+    return 365.25 * (np.repeat(np.arange(6.0), 2) + np.tile([-1.0, 1.0], 6) * np.arcsin(sine) / (2 * np.pi))
+
+
 @pytest.mark.parametrize(
     ("days", "forms"),
     [
@@ -264,6 +281,9 @@ def test_sigmas_have_what_dates_of_one_season_share(of_season):
         (np.arange(9) * 365.25 / 2, (1, 0)),
         (np.arange(13) * 365.25 / 4, (2, 1)),
         (np.arange(80) * 12.0, (2, 2)),
+        # Two dates a year: the sine at both is 0.29 or 0.31, and that of half a year 0.56 or 0.59.
+        (alternating(0.29), (0, 1)),
+        (alternating(0.31), (1, 1)),
     ],
 )
 def test_waves_that_the_dates_do_not_sample_are_left_out(days, forms):

@@ -161,9 +161,15 @@ def test_a_wrong_edge_leaves_and_what_loops_show_is_added():
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize(("left_out", "wrong", "known"), [((), (7,), True), ((), (7, 9), False), ((8,), (7,), False)])
+@pytest.mark.parametrize(
+    ("left_out", "wrong", "known"),
+    [((), (7,), True), ((), (7, 9), False), ((8,), (7,), False), ((8, 9), (), True), ((7, 8, 9), (), True)],
+)
 def test_edges_of_a_date_that_contradict_each_other_are_not_accepted(seed, left_out, wrong, known):
-    """The last date has edges 7, 8 and 9. Two that agree are right; if none agree, nothing tells which is right."""
+    """The last date has edges 7, 8 and 9. Two that agree are right; if none agree, nothing tells which is right.
+
+    A single edge contradicts none.
+    """
     edges, trends, errors, place = loops()
     value, random = trends.value.copy(), np.random.default_rng(seed)
     value[list(wrong), 0] += random.choice([-1, 1], (len(wrong), 2)) * random.uniform(4, 15, (len(wrong), 2))
@@ -189,6 +195,38 @@ def test_an_error_of_edges_that_their_places_do_not_show_is_found_from_loops(siz
     closures, found = network.accepted_edges(edges, trends, errors, place, 110)
     assert closures.accepted.mean() > 0.99
     np.testing.assert_allclose(found.constant, size**2, rtol=0.2)
+
+
+@pytest.mark.parametrize("errors", [[(0.6, -0.3)], [(0.6, -0.3), (0.4, 0.9)], [(0.5, 0.7), (0.6, -0.3), (0.4, 0.9)]])
+def test_what_few_loops_show_is_as_uncertain_as_students_distribution(errors):
+    """Triangles of dates that have one date in common, with the error of each loop.
+
+    Each of three edges errs by a third of it, so a constant variance is a third of the mean square. Spreads that n
+    loops show count as larger, by the quantile of Student's distribution over that of the normal distribution.
+    """
+    count = len(errors)
+    pairs = np.array([(2 * k + i, j) for k in range(count) for i, j in ((1, 0), (2, 2 * k + 1), (2, 0))])
+    value = np.zeros((3 * count, 4, 2))
+    value[::3] = np.array(errors)[:, None]
+    edges = Edges(pairs[:, 0], pairs[:, 1], value, np.full((3 * count, 4), 0.01), np.full(3 * count, 0.02))
+    place = np.random.default_rng(1).uniform(-1, 1, (4, 2))
+    trends = Trends(
+        np.ones((4, 1)), np.full((3 * count, 4, 1), 0.25), value[:, :1], np.zeros_like(value),
+        np.ones((3 * count, 4), dtype=bool),
+    )  # fmt: skip
+    white = 1e-6 * np.eye(7)[[0, 0]]
+    known = ErrorComponents(0.0 * white, white, np.ones(2 * count + 1), np.ones(3 * count), np.zeros(2))
+    closures, found = network.accepted_edges(edges, trends, known, place, 2 * count + 1)
+    assert closures.accepted.all()
+    stated = 0.02**2 + 1e-6 / 4
+    quantile = {1: 12.706, 2: 4.303, 3: 3.182}[count] / 1.960
+    wanted = (np.square(errors).mean(axis=0) / 3 - stated) * quantile**2
+    np.testing.assert_allclose(found.constant, wanted, rtol=2e-3)
+    # Without an error of loops, the constant takes from what is stated, and has no interval.
+    _, exact = network.accepted_edges(
+        edges, dataclasses.replace(trends, value=0.0 * trends.value), known, place, 2 * count + 1
+    )
+    np.testing.assert_allclose(exact.constant, -count / (count + 10) * 0.02**2)
 
 
 def test_corrections_relative_to_one_date_and_to_a_mean():
@@ -240,12 +278,13 @@ def test_the_mean_shift_of_the_stack_is_zero():
 
 
 def test_a_step_is_reported_by_the_number_of_its_date_among_all():
-    """Dates without pairs and without a time come before the step; it keeps its number, and its size."""
+    """Dates without pairs come before the step; it keeps its number, and its size."""
     made = Truth(seed=11, dates=30, error=0.0, scatter=0.3, step=3.0, hidden=0.0).made()
-    kept = (made.edges.first != 4) & (made.edges.second != 4)
+    alone = [2, 5, 8, 11]
+    kept = ~np.isin(made.edges.first, alone) & ~np.isin(made.edges.second, alone)
     stack = adjust(made.truth.cells, made.edges.select(kept), made.years.tolist())
     assert [one.date for one in stack.steps] == [15]
-    before, after = np.setdiff1d(np.arange(15), [4]), np.arange(15, 30)
+    before, after = np.setdiff1d(np.arange(15), alone), np.arange(15, 30)
     expected = made.shift[after].mean(axis=0) - made.shift[before].mean(axis=0)
     np.testing.assert_allclose(stack.steps[0].size, expected, atol=0.15)
 
