@@ -9,16 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chains import PIXEL, Chain, fly
+from chains import Chain, fly
 from scipy import stats
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND
 from ortho_pipeline.block.fit import BlockFit, merged
 from ortho_pipeline.block.heights.adjusted_dem import AdjustedDem, known_errors
-from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.heights.settling import Heights
-from ortho_pipeline.block.heights.spots import SpotsRecord
 from ortho_pipeline.block.intersection import ray_angles
 from ortho_pipeline.block.relative.joins import Join, joins_of, weak_joins
 from ortho_pipeline.block.reliability import known_points
@@ -51,6 +49,18 @@ def plan(fit: BlockFit, image: str, params: np.ndarray, shared: np.ndarray) -> n
     return np.asarray(ground_transform(model.crs, "EPSG:32636")(found)[:, :2].mean(axis=0))
 
 
+def pixel(fit: BlockFit, image: str, shared: np.ndarray) -> float:
+    """Return the side (m) of the square that a pixel covers on level ground, by the mean area at shared points."""
+    ground, model = fit.ground[shared], fit.models[image]
+    seen = model.ground_to_image(ground_transform(GEODETIC, model.crs)(ground))
+    right, left, below, above = (
+        ground_transform(model.crs, "EPSG:32636")(model.image_to_ground(seen + way, ground[:, 2]))[:, :2]
+        for way in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
+    )
+    columns, rows = (right - left).T, (below - above).T
+    return math.sqrt(np.abs(columns[0] * rows[1] - columns[1] * rows[0]).mean())
+
+
 def test_the_covariance_of_a_join_is_that_of_the_distance_of_both_images(chain: BlockFit) -> None:
     points, names = chain.points, [image for image, _ in chain.parameters]
     joins = joins_of(chain)
@@ -67,7 +77,7 @@ def test_the_covariance_of_a_join_is_that_of_the_distance_of_both_images(chain: 
                 step = 0.01 * np.eye(len(params))[k]
                 ends = [plan(chain, image, params + way * step, shared) for way in (1.0, -1.0)]
                 moves[:, column] = sign * (ends[0] - ends[1]) / 0.02
-        assert join.pixel == pytest.approx(PIXEL, rel=0.1)
+        assert join.pixel == pytest.approx(pixel(chain, join.first, shared), rel=2e-3)
         wanted = moves @ chain.covariance @ moves.T / join.pixel**2
         np.testing.assert_allclose(join.covariance, wanted, atol=2e-3 * np.abs(wanted).max())
 
@@ -283,6 +293,16 @@ def test_variances_are_applied_as_sigmas(sigmas: Any, separable: bool, assumed: 
     assert Variances(1.0, None, None, (9.0, 0.0, 0.0), (0, 0)).notes() == []
 
 
+@pytest.mark.parametrize(("plan", "height"), [(1.9, 2.1), (2.1, 1.9)])
+def test_a_sigma_of_less_than_two_degrees_of_freedom_is_hardly_determined(plan: float, height: float) -> None:
+    (note,) = Variances(1.0, 0.4, 0.7, (9.0, plan, height), (5, 3)).notes()
+    of_plan, of_height = (", hardly determined" if part < 2 else "" for part in (plan, height))
+    text = f"0.4 m in plan (redundancy {plan}{of_plan}) and 0.7 m in height (redundancy {height}{of_height})"
+    assert f"5 control points without a stated sigma: estimated as {text};" in str(note)
+    (alone,) = Variances(1.0, None, 0.7, (9.0, 0.0, height), (0, 1)).notes()
+    assert f"1 control point without a stated sigma: estimated as {text.partition(' and ')[2]};" in str(alone)
+
+
 def test_a_shared_parameter_is_published_in_its_unit() -> None:
     """One with the information 3, one that the block hardly tells of: at 5 % it does."""
     for weak, known in ((0.04, False), (0.06, True)):
@@ -388,34 +408,6 @@ def test_heights_of_unknown_accuracy_say_nothing_of_orthos() -> None:
         sigmas=np.array([2.0, 2.0, np.nan, np.inf]),
     )  # fmt: skip
     assert np.isfinite(AdjustedDem.of(heights, None, 0.0).loads).all(axis=1).tolist() == [True, False, False, False]
-
-
-def record(**more: Any) -> HeightsRecord:
-    plain: dict[str, Any] = {
-        "used": 90, "left_out": (), "at_breaks": 0, "without": 0, "sigma_m": 2.0, "sigma_is": "stated", "rms_m": 1.0,
-        "mean_error_m": 0.0, "bias_m": 0.0, "bias_sigma_m": 1.0, "bias_prior_m": 2.0, "shift_m": (3.0, -4.0),
-        "shift_sigma_m": (0.5, 0.25), "shift_prior_m": 5.0, "shift_chance": None, "shift_applied": False,
-        "correlation_m": None,
-    }  # fmt: skip
-    return HeightsRecord(**{**plain, **more})
-
-
-def test_what_is_said_of_heights() -> None:
-    assert record(shift_chance=0.0011).notices() == []
-    (shifted,) = record(shift_chance=0.0009).notices()
-    assert (shifted.code, shifted.fields["east_m"], shifted.fields["north_m"]) == ("dem-shifted", 3.0, -4.0)
-    assert "5.00 m (+3.0 m east, -4.0 m north, sigma 0.50 m" in str(shifted)
-    (several,) = record(left_out=tuple(f"t{k}" for k in range(12))).notices()
-    assert several.fields["count"] == 12
-    assert several.fields["points"] == [f"t{k}" for k in range(10)]
-    spots = SpotsRecord(used=3, left_out=("s1", "s2"), without=0, mean_m=0.0, rms_m=0.1)
-    (left,) = record(spots=spots).notices()
-    assert (left.code, left.fields["count"], left.fields["points"]) == ("spot-heights-left-out", 2, ["s1", "s2"])
-    for source in ("assumed", "estimated", "enlarged", "contradicted"):
-        code = "by-default" if source == "assumed" else source
-        (notice,) = record(sigma_is=source).notices()
-        assert notice.code == f"dem-sigma-{code}"
-        assert notice.fields["dem_sigma_m"] == 2.0
 
 
 # -- figures of a fit --------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
@@ -262,6 +263,23 @@ def test_the_chance_of_a_shift_is_that_of_chi_squared_of_what_the_block_says() -
     np.testing.assert_allclose(covariance, np.diag([64 / 5, 64 / 10]), atol=1e-12)
 
 
+def test_the_chance_of_correlated_errors_is_that_of_a_distribution_with_their_mean_and_variance() -> None:
+    """Estimates of variance 1/2 each have a sum of squares as chi-squared; bias and shift are none of them."""
+    told, value = [0.5, 2.0, 3.0, *[1.0] * 4], [9.0, -9.0, 9.0, 0.7, -1.2, 0.4, 1.1]
+    square = 0.49 + 1.44 + 0.16 + 1.21
+    assert common(told, value).chance_of_correlated == pytest.approx(float(stats.chi2.sf(2.0 * square, 4)))
+    root = np.random.default_rng(8).normal(size=(7, 7))
+    dense = replace(common(told, value), told=root @ root.T)
+    spread = np.linalg.solve(np.eye(7) + dense.told, dense.told)[3:, 3:]
+    mean, variance = np.trace(spread), 2.0 * np.trace(spread @ spread)
+    wanted = stats.gamma.sf(square, mean**2 / variance, scale=variance / mean)
+    assert 0.01 < wanted < 0.99
+    assert dense.chance_of_correlated == pytest.approx(float(wanted))
+    # Of which nothing is told, or there are none, nothing is improbable.
+    for nothing in (common([1.0] * 3, [9.0] * 3), common([1.0] * 3 + [0.0] * 4, value)):
+        assert nothing.chance_of_correlated == 1.0
+
+
 def test_shared_errors_in_metres() -> None:
     found = common([3.0, 0.0, 0.0], [0.5, 1.0, 2.0], loads=np.array([[5.0, 0.0, 0.0], [5.0, 0.0, 0.0]]))
     assert found.bias == pytest.approx((2.5, 2.5))
@@ -312,7 +330,9 @@ def test_a_spot_is_wrong_beyond_four_sigmas_of_it_and_of_the_estimate() -> None:
     spots = SpotHeights(np.zeros((4, 3)), np.full(4, 3.0), np.zeros(4), tuple("abcd"))
     flat, none = np.zeros((4, 2)), np.zeros(4, dtype=bool)
     # Sigmas: 3 m of the spot, 4 m of the DEM, and 12 m of the bias after one observation: 13 m.
-    made = SpotDifferences(spots, np.array([51.9, 52.1, -51.9, -52.1]), flat, None, np.ones(4), np.zeros((4, 3)), none)
+    # However many share the information of a spot, it varies by itself.
+    own, apart = np.array([1.0, 4.0, 4.0, 1.0]), np.array([51.9, 52.1, -51.9, -52.1])
+    made = SpotDifferences(spots, apart, flat, None, own, np.zeros((4, 3)), none)
     made = made.with_loads(24.0, 0.0, np.zeros((4, 0)), None)
     judged = made.judged(common([3.0, 0.0, 0.0], [0.0, 0.0, 0.0]), 4.0)
     assert judged.wrong.tolist() == [False, True, False, True]

@@ -11,7 +11,8 @@ import pytest
 
 from ortho_pipeline.block.heights.adjusted_dem import AdjustedDem
 from ortho_pipeline.block.heights.common_heights import CommonHeights
-from ortho_pipeline.block.heights.record import record_of
+from ortho_pipeline.block.heights.record import HeightsRecord, record_of
+from ortho_pipeline.block.heights.spots import SpotsRecord
 from ortho_pipeline.report.block import height_lines
 
 COUNT = 12
@@ -95,3 +96,85 @@ def test_an_adjusted_dem_errs_by_what_is_estimated_but_not_corrected(applied: bo
     np.testing.assert_array_equal(found.loads[0], heights.common.loads[0])
     np.testing.assert_array_equal(found.slopes, np.where(some(1)[:, None], 0.0, (0.2, -0.1)))
     assert found.sample == 30.0
+
+
+# -- notices -----------------------------------------------------------------------------------------------------------
+
+
+def record(**more: Any) -> HeightsRecord:
+    plain: dict[str, Any] = {
+        "used": 90, "left_out": (), "at_breaks": 0, "without": 0, "sigma_m": 2.0, "sigma_is": "stated", "rms_m": 1.0,
+        "mean_error_m": 0.0, "bias_m": 0.0, "bias_sigma_m": 1.0, "bias_prior_m": 2.0, "shift_m": (3.0, -4.0),
+        "shift_sigma_m": (0.5, 0.25), "shift_prior_m": 5.0, "shift_chance": None, "shift_applied": False,
+        "correlation_m": None,
+    }  # fmt: skip
+    return HeightsRecord(**{**plain, **more})
+
+
+def test_what_is_said_of_heights() -> None:
+    assert record(shift_chance=0.0011).notices() == []
+    (shifted,) = record(shift_chance=0.0009).notices()
+    assert (shifted.code, shifted.fields["east_m"], shifted.fields["north_m"]) == ("dem-shifted", 3.0, -4.0)
+    assert "5.00 m (+3.0 m east, -4.0 m north, sigma 0.50 m" in str(shifted)
+    (several,) = record(left_out=tuple(f"t{k}" for k in range(12))).notices()
+    assert several.fields["count"] == 12
+    assert several.fields["points"] == [f"t{k}" for k in range(10)]
+    spots = SpotsRecord(used=3, left_out=("s1", "s2"), without=0, mean_m=0.0, rms_m=0.1)
+    (left,) = record(spots=spots).notices()
+    assert (left.code, left.fields["count"], left.fields["points"]) == ("spot-heights-left-out", 2, ["s1", "s2"])
+    for source in ("assumed", "estimated", "enlarged", "contradicted"):
+        code = "by-default" if source == "assumed" else source
+        (notice,) = record(sigma_is=source).notices()
+        assert notice.code == f"dem-sigma-{code}"
+        assert notice.fields["dem_sigma_m"] == 2.0
+
+
+DATUMS = {"sigma_m": 8.0, "bias_sigma_m": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("more", "limit", "whose"),
+    [
+        # A few metres are no datum; beyond that, four sigmas of the difference are: of 10 m and 7.5 m, of 8 m and 6 m.
+        ({"bias_sigma_m": 1.0}, 20.0, "block"),
+        ({"bias_prior_m": 10.0, "bias_sigma_m": 7.5}, 50.0, "block"),
+        (DATUMS, 40.0, "block"),
+        # Spot heights that fix a bias of which nothing is known: its prior is no accuracy.
+        ({**DATUMS, "bias_prior_m": 100.0, "spots": (3, 0, 0.0)}, 40.0, "spot heights"),
+        ({**DATUMS, "bias_prior_m": 24.0, "bias_sigma_m": 7.0, "spots": (3, 1, 0.0)}, 100.0, "spot heights"),
+        # Without any spot that agrees, the bias is that of the block.
+        ({**DATUMS, "spots": (0, 2, 300.0)}, 40.0, "block"),
+    ],
+)
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_dem_of_another_datum_differs_by_more_than_its_accuracy(
+    more: dict[str, Any], limit: float, whose: str, way: float
+) -> None:
+    more = dict(more)
+    used, left_out, mean = more.pop("spots", (None, 0, 0.0))
+    if used is not None:
+        names = tuple(f"s{k}" for k in range(left_out))
+        more["spots"] = SpotsRecord(used=used, left_out=names, without=0, mean_m=mean, rms_m=0.1)
+    assert "heights-disagree" not in {one.code for one in record(bias_m=0.98 * way * limit, **more).notices()}
+    found = {one.code: one for one in record(bias_m=1.02 * way * limit, **more).notices()}
+    notice = found["heights-disagree"]
+    assert f"m {'above' if way > 0 else 'below'} the {whose}, although" in str(notice)
+    assert notice.fields["median_m"] == pytest.approx(-1.02 * way * limit)
+    assert notice.fields["spread_m"] == more["bias_sigma_m"]
+    assert ("points.spot_vertical" in str(notice)) == (whose == "spot heights")
+    assert ("spot-heights-left-out" in found) == bool(used and left_out)
+
+
+@pytest.mark.parametrize("mean", [46.0, -34.0])
+def test_three_spot_heights_that_all_contradict_the_block_show_another_datum(mean: float) -> None:
+    """The DEM is 5 m above the block and 46 m above the spot heights: these are 41 m below the block."""
+    for left_out, far, codes in (
+        (3, mean, ["heights-disagree"]), (2, mean, ["spot-heights-left-out"]),
+        (3, mean - np.sign(mean) * 2.0, ["spot-heights-left-out"]),
+    ):  # fmt: skip
+        spots = SpotsRecord(used=0, left_out=tuple("abc"[:left_out]), without=0, mean_m=far, rms_m=None)
+        found = record(**DATUMS, bias_m=5.0 if mean > 0 else 7.0, spots=spots).notices()
+        assert [one.code for one in found] == codes
+    (notice,) = record(**DATUMS, bias_m=5.0 if mean > 0 else 7.0, spots=spots.replaced(mean_m=mean)).notices()
+    assert notice.fields["median_m"] == (-41.0 if mean > 0 else 41.0)
+    assert f"41.0 m {'above' if mean > 0 else 'below'} the spot heights" in str(notice)

@@ -11,6 +11,7 @@ from chains import CRS, EAST, NORTH
 
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.heights.spots import SpotDifferences
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.points.heights.spot_heights import SpotHeights
 from ortho_pipeline.surface.dem import open_dem
@@ -34,11 +35,13 @@ def source(folder: Path, apart: np.ndarray, sigma: float | None, plan: float = 0
     return DemHeights(surface, spots=spots, shift=8.0)
 
 
-@pytest.mark.parametrize(("stated", "assumed"), [(2.0, 77.0), (None, 2.0)])
+@pytest.mark.parametrize(("stated", "assumed", "sharing"), [(2.0, 77.0, 1.0), (None, 2.0, 1.0), (2.0, 77.0, 5.0)])
 def test_a_spot_is_wrong_at_four_sigmas_of_the_difference_from_the_median(
-    tmp_path: Path, stated: float | None, assumed: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: float | None, assumed: float, sharing: float
 ) -> None:
-    """2 m of the DEM, 0.5 m of the spot, and 3 m of its place on a slope of 0.36."""
+    """2 m of the DEM, 0.5 m of the spot, and 3 m of its place on a slope of 0.36, however many share a sample."""
+    if sharing > 1.0:
+        monkeypatch.setattr(DemHeights, "sharing", lambda source, ground: np.full(len(ground), sharing))
     sigma = np.sqrt(4.0 + 0.25 + 9.0 * (SLOPES**2).sum())
     off = np.array(
         [0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 3.9 * sigma, -3.9 * sigma, 4.1 * sigma, -4.1 * sigma, 0.0, 9.0]
@@ -52,7 +55,7 @@ def test_a_spot_is_wrong_at_four_sigmas_of_the_difference_from_the_median(
     assert np.flatnonzero(found.wrong).tolist() == [9, 10]
     assert np.flatnonzero(found.used).tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 8, 11]
     assert (found.stated is None) == (stated is None)
-    np.testing.assert_allclose(found.own, 1.0)
+    np.testing.assert_allclose(found.own, sharing)
     np.testing.assert_array_equal(found.loads, np.zeros((13, 3)))
 
 
@@ -77,6 +80,14 @@ def test_a_dem_that_was_moved_is_read_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.loads[:, [0, 3]], made.loads[:, [0, 3]])
     np.testing.assert_array_equal(found.wrong, made.wrong)
     assert (found.scale, found.own.tolist()) == (1.7, [0.4] * 12)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_spots_farther_than_any_geoid_is_from_the_ellipsoid_are_refused(tmp_path: Path, way: float) -> None:
+    """A geoid is at most 107 m off, and two of them are 200 m apart at most."""
+    assert SpotDifferences.of(source(tmp_path, np.full(12, 195.0 * way), 1.5), 10.0) is not None
+    with pytest.raises(InputError, match=f"are 205.0 m {'below' if way > 0 else 'above'} the DEM"):
+        SpotDifferences.of(source(tmp_path, np.full(12, 205.0 * way), 1.5), 10.0)
 
 
 def test_a_dem_without_spots_has_no_differences(tmp_path: Path) -> None:
