@@ -24,7 +24,7 @@ from ortho_pipeline.block.adjustment import (
 from ortho_pipeline.block.determination import refuse_many_outside
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import Pseudo
-from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
+from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame, enu_partials
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.observations.prior import Prior
@@ -272,3 +272,45 @@ def test_figures_of_points_and_rays_are_in_the_order_of_the_table(
     assert fit.sigma0 == pytest.approx(math.sqrt(weighted / fit.degrees_of_freedom), rel=0.15)
     with pytest.raises(InputError, match="cannot exclude 'b'"):
         adjust(flown.start, table, exclude=["c", "b", out[0]])
+
+
+def test_a_point_that_was_rejected_is_not_named_as_one_with_too_few_rays(flown: Block, points: BlockPoints) -> None:
+    """A tie of two rays that miss each other is a gross error, and a tie of one ray takes no part."""
+    two = np.flatnonzero(points.tie & (np.bincount(points.point) == 2))
+    wrong, alone = two[[0, 3]]
+    measured = points.measured.copy()
+    rays = np.flatnonzero(points.point == wrong)
+    measured[rays] += [[0.0, 40.0], [0.0, -40.0]]
+    table = replace(points, measured=measured)
+    table = table.of_rays(np.arange(points.rays) != np.flatnonzero(points.point == alone)[0])
+    fit = adjust(flown.start, table)
+    assert [(one.point, one.what) for one in fit.rejected] == [(points.ids[wrong], "point")]
+    (notice,) = [one for one in fit.warnings if one.code == "takes-no-part"]
+    assert notice.fields["points"] == [points.ids[alone]]
+
+
+def test_the_covariance_of_a_tie_is_that_of_its_rays_and_of_the_parameters_of_its_images(flown: Block) -> None:
+    """Parameters err as their start values, which are held firmly. What rays add has one factor for all ties.
+
+    It is that of measurements, with the uncertainty of Student's distribution.
+    """
+    fit = adjust(flown.start, flown.points, robust=False, hold=0.3)
+    points, images, factors = fit.points, np.array([image for image, _ in fit.parameters]), []
+    for k in range(len(points)):
+        by_point, by_params = [], []
+        for ray in np.flatnonzero(points.point == k):
+            name, ground = points.images[points.image[ray]], fit.ground[[k]]
+            model, row = fit.models[name], np.zeros((2, len(images)))
+            row[:, images == name] = model.param_partials(ground_transform(GEODETIC, model.crs)(ground))[0]
+            by_point.append(enu_partials(model, ground)[0] / points.sigma_image[ray])
+            by_params.append(row / points.sigma_image[ray])
+        rows = np.concatenate(by_point)
+        inverse = np.linalg.inv(rows.T @ rows)
+        gain = inverse @ rows.T @ np.concatenate(by_params)
+        of_rays = fit.ground_covariance[k] - gain @ fit.covariance @ gain.T
+        factors.append(np.trace(of_rays) / np.trace(inverse))
+        np.testing.assert_allclose(of_rays, factors[-1] * inverse, atol=1e-3 * np.trace(fit.ground_covariance[k]))
+    np.testing.assert_allclose(factors, factors[0], rtol=0.01)
+    assert fit.sigma0 is not None
+    freedom = fit.degrees_of_freedom
+    assert np.mean(factors) == pytest.approx(fit.sigma0**2 * freedom / (freedom - 2), rel=0.05)

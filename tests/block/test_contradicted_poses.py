@@ -5,6 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
+from scipy import stats
 
 from ortho_pipeline.block.equations.problem import Pseudo
 from ortho_pipeline.block.reliability.poses import contradicted_poses
@@ -50,6 +52,8 @@ def test_positions_or_angles_that_move_farther_are_told_with_both_sizes():
     (one,) = told(changes(1) * factors[::-1])
     assert (one.fields["what"], one.fields["unit"]) == ("angles", "°")
     assert np.isclose(one.fields["sigma"], np.degrees(0.05))
+    apart = (changes(1) * factors[::-1])[:, 3:]
+    assert np.isclose(one.fields["rms"], np.degrees(np.sqrt(np.mean((apart - apart.mean(axis=0)) ** 2))))
 
 
 def test_an_error_that_all_images_share_is_none_of_their_accuracy():
@@ -69,3 +73,14 @@ def test_accuracies_of_images_count_by_themselves():
 def test_what_defines_a_datum_and_a_pose_alone_contradict_nothing():
     assert told(100 * changes(4), held=True) == []
     assert told(100 * changes(4, count=1)) == []
+
+
+@pytest.mark.parametrize(("part", "named"), [(0.985, []), (1.015, ["positions"])])
+@pytest.mark.parametrize("images", [2, 5])
+def test_poses_contradict_at_a_chance_of_one_in_ten_thousand(images: int, part: float, named: list[str]) -> None:
+    """Along each of three axes, changes without their mean have a degree of freedom less than images."""
+    moved = np.random.default_rng(5).normal(0, 1, (images, 6)) * [1, 1, 1, 0, 0, 0]
+    moved -= moved.mean(axis=0)
+    square = stats.chi2.isf(1e-4, 3 * (images - 1))
+    moved *= part * np.sqrt(square / (moved**2).sum())
+    assert [one.fields["what"] for one in told(moved * ACCURACIES)] == named

@@ -14,6 +14,7 @@ from chains import ORIGIN, Chain, fly
 from ortho_pipeline.block import adjustment, determination
 from ortho_pipeline.block.adjustment import _prepared
 from ortho_pipeline.block.determination import (
+    missing_most,
     naming_wrong_points,
     refuse_too_few,
     refuse_undetermined,
@@ -22,6 +23,7 @@ from ortho_pipeline.block.determination import (
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
 from ortho_pipeline.block.equations.unknowns import Columns
+from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.models import ImageCorrection
 
@@ -256,6 +258,32 @@ def test_errors_of_the_first_solution_name_points_that_miss_at_the_start(prepare
     assert named == list(points.ids[:wrong])
     remedy = "check these points first, and delete wrong ones; or give more points" if wrong else "give more points"
     assert str(error.value.remedy) == remedy
+
+
+@pytest.mark.parametrize(("usual", "part", "named"), [
+    (0.0, 0.99, []), (0.0, 1.01, [3, 8]), (3.0, 0.99, []), (3.0, 1.01, [3, 8]),
+])  # fmt: skip
+def test_rays_that_miss_most_are_twenty_sigmas_off_and_twice_as_far_as_others(
+    prepared: Prepared, usual: float, part: float, named: list[int]
+) -> None:
+    """A measurement has a sigma of 0.1 px. Where all rays are 3 px off, 6 px are far; the worst ray of a point counts.
+
+    A ray that takes no part tells nothing.
+    """
+    problem, state, selection = prepared
+    points = problem.points
+    measured = predict(problem.frame, state.models, points, state.local)
+    worst = np.full(len(points), usual)
+    worst[[3, 8]] = part * max(2.0 * usual, 2.0)
+    last = np.array([np.flatnonzero(points.point == k)[-1] for k in range(len(points))])
+    measured[last] += worst[:, None] * [0.6, -0.8]
+    first, rays = int(np.flatnonzero(points.point == 5)[0]), selection.rays.copy()
+    measured[first] += 500.0
+    rays[first] = False
+    moved = replace(problem, points=replace(points, measured=measured))
+    found, far = missing_most(moved, state, replace(selection, rays=rays))
+    assert np.flatnonzero(far).tolist() == named
+    np.testing.assert_allclose(found, np.where(worst > 2.0, worst, 0.0), atol=1e-6)
 
 
 def test_an_error_of_the_start_that_known_ground_shares_is_no_wrong_point(prepared: Prepared) -> None:

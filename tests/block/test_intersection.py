@@ -10,8 +10,17 @@ import numpy as np
 import pyproj
 import pytest
 from pair import Pair
+from scipy import stats
 
-from ortho_pipeline.block.intersection import _LONGEST, PARALLEL, _solved, frame_of, intersect, models_of
+from ortho_pipeline.block.intersection import (
+    _LONGEST,
+    PARALLEL,
+    _contradicting,
+    _solved,
+    frame_of,
+    intersect,
+    models_of,
+)
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.models import MapPlane
@@ -230,6 +239,11 @@ def test_gross_errors_are_named_and_do_not_scale_the_sigmas_of_other_points() ->
     models = {name: MODELS[name] for name in ("a", "b")}
     clean = intersect(models, points)
     assert not clean.contradicting.any()
+    # Measurements err by half a pixel, of 1 m and of 2 m: along the rows, rays miss each other by 1.1 m.
+    for metres, named in ((3.0, []), (8.0, [7])):
+        less = points.measured.copy()
+        less[7, 1] += metres
+        assert np.flatnonzero(intersect(models, replace(points, measured=less)).contradicting).tolist() == named
     points.measured[7, 1] += 30.0
     found = intersect(models, points)
     assert np.flatnonzero(found.contradicting).tolist() == [7]
@@ -241,3 +255,14 @@ def test_gross_errors_are_named_and_do_not_scale_the_sigmas_of_other_points() ->
     assert np.flatnonzero(several.contradicting).tolist() == [3, 7, 12, 20, 31]
     assert several.sigma0 == pytest.approx(clean.sigma0, rel=0.1)
     assert not intersect(models, replace(points, measured=measured)).contradicting.any()
+
+
+def test_a_point_that_only_looks_far_off_counts_with_the_others() -> None:
+    """Among very exact points a usual one looks wrong. It is tested first, before one that is, and stays."""
+    squares = np.array([900.0, *[0.01] * 12, *[0.5] * 6, 3.0])
+    others = squares[1:-1]
+    assert stats.f.sf(3.0 / others.mean(), 1, 18) > 1e-3 / 20
+    assert stats.f.sf(900.0 / squares[1:].mean(), 1, 19) < 1e-3 / 20
+    for order in (np.arange(20), np.arange(20)[::-1]):
+        found = _contradicting(squares[order], np.ones(20, dtype=np.int64))
+        assert order[found].tolist() == [0]

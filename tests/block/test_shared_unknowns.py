@@ -32,13 +32,19 @@ def flown() -> Block:
     return fly(Chain(images=3, convergence_deg=10.0, ties=40, errors=1.0), 2)
 
 
-def with_columns(solved: Solved, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the cofactors and the best of all unknowns with further ones of variance 1, and the design."""
+def with_columns(
+    solved: Solved, columns: np.ndarray, values: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return cofactors and best steps of all unknowns with further ones of variance 1 and their values, and the design.
+
+    Values are zero if they are not given.
+    """
     design, misfits = dense(solved.linear)
     count = columns.shape[1]
+    known = np.zeros(count) if values is None else values
     whole = np.vstack([np.hstack([design, columns]), np.eye(count, design.shape[1] + count, design.shape[1])])
     cofactors = np.linalg.inv(whole.T @ whole)
-    return cofactors, cofactors @ (whole.T @ np.concatenate([misfits, np.zeros(count)])), design
+    return cofactors, cofactors @ (whole.T @ np.concatenate([misfits, -known])), design
 
 
 def test_an_error_of_known_ground_is_a_pair_of_unknowns(flown: Block) -> None:
@@ -103,12 +109,15 @@ def check_dem(found: AdjustedDem | None, common: CommonHeights, mixed: np.ndarra
     loads = common.loads[rows]
     np.testing.assert_allclose(heights @ found.loads[rows].T, loads @ own @ loads.T, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(heights @ found.by_params.T, loads @ mixed.T, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(found.known, -2.0, atol=1e-12)
+    np.testing.assert_allclose(found.known, common.loads @ common.value - 2.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("with_dem", [False, True])
-def test_a_shared_parameter_is_one_unknown(flown: Block, tmp_path: Path, with_dem: bool) -> None:
-    """Two images share the column of a shift, the third has its own; heights of a DEM err together, too."""
+@pytest.mark.parametrize(("with_dem", "bias"), [(False, 0.0), (True, 0.0), (True, 0.8)])
+def test_a_shared_parameter_is_one_unknown(flown: Block, tmp_path: Path, with_dem: bool, bias: float) -> None:
+    """Two images share the column of a shift, the third has its own; heights of a DEM err together, too.
+
+    The heights' errors are not settled: their estimates are zero, or a bias of some standard deviations.
+    """
     shared, apart = Prior(1.0, 3.0, shared="one camera"), Prior(0.5, 2.0, shared="another")
     name, other = flown.start["i0"].param_names
     priors: dict[str, dict[str, Prior]] = {
@@ -125,9 +134,10 @@ def test_a_shared_parameter_is_one_unknown(flown: Block, tmp_path: Path, with_de
         (name, ("i0", "i1"), (0, 2)), (name, ("i2",), (4,))
     ]  # fmt: skip
     heights = None if source is None else Heights.under(source, problem, state.local)
+    if heights is not None:
+        heights = replace(heights, common=replace(heights.common, value=np.array([bias, 0.0, 0.0])))
     problem = problem if heights is None else heights.applied(problem)
     solved = attempt(problem, state, selection)
-    # The heights' errors are not settled: they are still zero.
     common = None if heights is None else heights.seen(solved)[0]
     found, slope = made._seen(solved, heights)
     (design, _), linear = dense(solved.linear), solved.linear
@@ -139,7 +149,9 @@ def test_a_shared_parameter_is_one_unknown(flown: Block, tmp_path: Path, with_de
             if pseudo.column in one.columns:
                 columns[rows + number, k] = -one.prior.sigma / pseudo.sigma
     extra = np.zeros((len(design), 0)) if common is None else of_heights(solved, common, len(design))
-    cofactors, best, _ = with_columns(solved, np.hstack([extra, columns]))
+    values = np.zeros(extra.shape[1] + 2)
+    values[: min(extra.shape[1], 1)] = bias
+    cofactors, best, _ = with_columns(solved, np.hstack([extra, columns]), values)
     np.testing.assert_allclose(found.left, cofactors[-2:, -2:], rtol=1e-6, atol=1e-10)
     size, numbers = problem.size, linear.ordering.numbers
     of_params = solved.cofactors.matrix + found.by_params @ found.left @ found.by_params.T

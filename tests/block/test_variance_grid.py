@@ -132,6 +132,23 @@ def test_ground_of_one_image_is_perfect_whatever_its_sigmas() -> None:
         assert found.image == pytest.approx(wanted, rel=1e-4)
 
 
+def test_without_redundancy_measurements_are_as_good_as_stated() -> None:
+    """One point of exact ground determines a shift, with the sigma of its measurement."""
+    flown = fly(Chain(images=2, convergence_deg=25.0, ties=40, errors=2.0, pairwise=False), 5)
+    both = with_control(flown, "i1", 1, sigma=1e-3)
+    rows = np.flatnonzero((both.image == 1) & (both.roles[both.point] == "control"))
+    points = replace(
+        both, images=("i1",), point=both.point[rows], image=np.zeros(1, dtype=int), measured=both.measured[rows],
+        sigma_image=np.full(1, 0.3),
+    )  # fmt: skip
+    solved = attempt(*_prepared((flown.start["i1"],), points, {}, ()))
+    assert solved.unit_weight() == (None, pytest.approx(0.0, abs=1e-6))
+    found = posterior(solved)
+    assert found.variances.image == 1.0
+    assert found.image_square == 1.0
+    np.testing.assert_allclose(found.covariance.variances, 0.3**2, rtol=1e-3)
+
+
 def likeliest(solved: Solved) -> float:
     """Return the factor of measurements with the greatest restricted likelihood, all equations in one dense matrix."""
     design, misfits = dense(solved.linear)
