@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 from samples import CRS, Memory
+from scipy.ndimage import map_coordinates
 
 from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.surface import dem as dem_module
 from ortho_pipeline.surface.dem import DemSurface, dem_of, open_dem
+from ortho_pipeline.surface.dem_file import Affine, SampleGrid
 from ortho_pipeline.surface.voids import nearest_heights
 
 HEIGHTS = np.random.default_rng(3).uniform(100.0, 900.0, (40, 50))
@@ -138,6 +141,69 @@ def test_an_excerpt_is_the_samples_where_they_are() -> None:
     assert (rows, columns) == (10 + 4 - 2, 15 + 4 - 7)
     # GDAL's corner of the first sample (7, 2) is half a sample before it.
     np.testing.assert_allclose(found.geotransform, (3e5 + 65.0, 10.0, 0.0, 6.28e6 - 15.0, 0.0, -10.0))
+
+
+def test_positions_may_have_heights_and_may_be_none() -> None:
+    places = at((3.0, 4.0), (20.5, 7.25))
+    places[:, 2] = np.nan, 900.0
+    for crs in (None, CRS):
+        np.testing.assert_array_equal(surface().heights(places, crs), surface().heights(places[:, :2], crs))
+        assert surface().coverage(places, crs) == 1.0
+        assert surface().coverage(places[:0], crs) == 1.0
+
+
+def test_the_edge_continues_as_far_as_the_reach_on_all_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within a circle about the nearest place of the DEM, with the height of that place."""
+    monkeypatch.setattr(dem_module, "NEAREST_REACH", 6)
+    random = np.random.default_rng(8)
+    u, v = random.uniform(-9, 58, 400), random.uniform(-9, 48, 400)
+    near_u, near_v = np.clip(u, 0, 49), np.clip(v, 0, 39)
+    heights = map_coordinates(HEIGHTS, [near_v, near_u], order=1)
+    expected = np.where(np.hypot(u - near_u, v - near_v) <= 6, heights, np.nan)
+    assert 40 < np.isnan(expected).sum() < 200
+    np.testing.assert_allclose(surface(fill="nearest").heights_at(u, v), expected, rtol=1e-9)
+
+
+class Elsewhere(Memory):
+    """Samples on another grid."""
+
+    def __init__(self, crs: str, place: Affine) -> None:
+        super().__init__(HEIGHTS, place[::3])  # type: ignore[arg-type]
+        self.grid = SampleGrid(pyproj.CRS(crs), HEIGHTS.shape, place)
+
+    def place(self) -> tuple[pyproj.CRS, SampleGrid]:
+        return self.grid.crs, self.grid
+
+
+@pytest.mark.parametrize(
+    ("crs", "place"),
+    [
+        ("EPSG:32735", (3e5, 9.0, 4.0, 6.28e6, 3.0, -8.0)), ("EPSG:32735", (3e5, -2.0, 9.0, 6.28e6, 11.0, 1.0)),
+        ("EPSG:4326", (24.0, 2e-3, 0.0, -33.0, 0.0, -1e-3)),
+    ],
+)  # fmt: skip
+def test_an_excerpt_has_the_heights_of_the_surface_and_three_samples_more(crs: str, place: Affine) -> None:
+    """As GDAL reads it: heights belong to the middles of its pixels. A point that is not finite has no part."""
+    made = dem_of(Elsewhere(crs, place), "ellipsoid", False, "mask", 10**8)  # type: ignore[arg-type]
+    u, v = np.random.default_rng(2).uniform([[10.1], [8.1]], [[29.9], [24.9]], (2, 30))
+    x, a, b, y, c, d = place
+    ground = np.column_stack([x + a * u + b * v, y + c * u + d * v, np.zeros(30)])
+    found = made.excerpt(np.concatenate([ground, np.full((1, 3), np.nan)]), crs)
+    assert found is not None
+    west, a, b, north, c, d = found.geotransform
+    columns, rows = np.linalg.solve([[a, b], [c, d]], (ground[:, :2] - (west, north)).T) - 0.5
+    np.testing.assert_allclose(
+        map_coordinates(found.heights, [rows, columns], order=1), map_coordinates(HEIGHTS, [v, u], order=1), rtol=1e-6
+    )
+    for places, count in ((rows, found.heights.shape[0]), (columns, found.heights.shape[1])):
+        assert places.min() >= 3
+        assert places.max() <= count - 1 - 3
+
+
+def test_there_is_no_excerpt_across_the_antimeridian() -> None:
+    made = dem_of(Elsewhere("EPSG:4326", (178.0, 0.1, 0.0, 10.0, 0.0, -0.1)), "ellipsoid", False, "mask", 10**8)  # type: ignore[arg-type]
+    assert made.excerpt(np.array([[179.5, 8.0, 0.0], [-179.5, 8.0, 0.0]]), "EPSG:4326") is None
+    assert made.excerpt(np.array([[179.5, 8.0, 0.0], [179.9, 8.0, 0.0]]), "EPSG:4326") is not None
 
 
 def test_a_dem_on_a_server_needs_the_network_to_be_allowed(tmp_path: Path) -> None:
