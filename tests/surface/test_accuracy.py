@@ -164,6 +164,23 @@ def test_another_datum_of_the_points_is_undone(made, tmp_path):
     np.testing.assert_allclose(one.differences, other.differences, atol=2e-3)
 
 
+def test_a_point_without_a_height_is_counted_and_not_compared(made, tmp_path):
+    """GeoJSON needs no heights; those that it has are ellipsoidal."""
+    lonlat = ground_transform(parse_crs(UTM), "EPSG:4979")([[WEST + 300, NORTH - 500, 0], [WEST + 400, NORTH - 500, 0]])
+    places = [[*lonlat[0, :2], 140.0], lonlat[1, :2].tolist()]
+    features = [
+        {"type": "Feature", "geometry": {"type": "Point", "coordinates": place}, "properties": {"id": f"c{k}"}}
+        for k, place in enumerate(places)
+    ]
+    (tmp_path / "heights.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    ground, crs, ids = read_check_heights(tmp_path / "heights.geojson")
+    assert ids == ("c0", "c1")
+    found = check_dem(opened(made), ground, crs, ids)
+    assert (found.overall.count, found.to_json()["without_height"]) == (1, 1)
+    expected = opened(made).heights(lonlat[:1, :2], "EPSG:4979")[0] - 140.0
+    np.testing.assert_allclose(found.differences, [expected, np.nan], atol=1e-6)
+
+
 def test_gross_errors_and_points_off_the_dem_are_told(made, tmp_path):
     path = tmp_path / "points.csv"
     more = [f"wild,{WEST + 500},{NORTH - 500},999", f"away,{WEST - 9000},{NORTH - 500},100"]

@@ -21,6 +21,7 @@ from ortho_pipeline.surface.footprint import (
     ground_sample_distance,
     image_grid,
     lay,
+    scene_pixels,
     two_digits,
 )
 from ortho_pipeline.surface.writing import write_dem
@@ -126,6 +127,18 @@ def test_the_default_grid_has_pixels_of_the_ground_in_the_middle_of_the_image() 
     assert choose_grid(model, found, (100, 80), crs=parse_crs(CRS), extent=given, resolution=(3, 4)).extent == given
     wide = choose_grid(model, found, (100, 80), crs=parse_crs(CRS), extent=given, resolution=(7.0, 9.0), align=True)
     assert wide.extent == pytest.approx((X // 7 * 7, (Y - 50) // 9 * 9, X // 7 * 7 + 42, -(-(Y - 10) // 9) * 9))
+
+
+def test_places_that_a_map_does_not_show_have_no_part_in_its_grid() -> None:
+    """UTM has no places a million kilometres from its origin."""
+    model, surface, crs, size = Straight(), FlatSurface(100.0), parse_crs("EPSG:4326"), (100, 80)
+    found, nowhere = lay(model, surface, *size), np.full((1, 3), 1e9)
+    more = replace(found, reach=np.concatenate([found.reach, nowhere]))
+    grids = [choose_grid(model, one, size, crs=crs, resolution=1e-5) for one in (found, more)]
+    assert grids[0].extent == grids[1].extent
+    assert scene_pixels(model, more, grids[0]) == scene_pixels(model, found, grids[0]) > 20_000
+    with pytest.raises(InputError, match="outside the area of 'WGS 84'"):
+        choose_grid(model, replace(found, reach=nowhere), size, crs=crs, resolution=1e-5)
 
 
 @pytest.mark.parametrize(("void", "middle"), [(False, 70.0), (True, 80.0)])
