@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyproj
 import pytest
-from dem_cells import ROWS, small_cells
+from dem_cells import ROWS, small_cells, write_cell
+from osgeo import gdal
 
+from ortho_pipeline.surface.cells import sources
 from ortho_pipeline.surface.cells.copernicus import Cell, Extent, cells_of_list, columns_at, extent_of
-from ortho_pipeline.surface.cells.sources import misplaced
+from ortho_pipeline.surface.cells.sources import fault_of, misplaced, source_of
 from ortho_pipeline.surface.dem_file import Affine
 
 
@@ -139,3 +145,36 @@ def test_a_file_of_a_cell_is_at_its_place_if_no_edge_is_off_by_a_hundredth_of_a_
         assert "another place" in misplaced(cell, shape, of_edges(cell, (west, north, east, south)))
     wider = misplaced(cell, (shape[0], shape[1] + 1), cell.grid.crs_from_pixel)
     assert f"it has {shape[1] + 1} x {ROWS} samples instead of {shape[1]} x {ROWS}" in wider
+
+
+def test_a_block_of_a_cell_that_cannot_be_unpacked_is_a_fault(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    small_cells(monkeypatch)
+    path = write_cell(tmp_path, Cell(20, -31))
+    assert fault_of(Cell(20, -31), path) == ""
+    dataset = gdal.Open(str(path))
+    place = int(dataset.GetRasterBand(1).GetMetadataItem("BLOCK_OFFSET_0_0", "TIFF"))
+    dataset = None
+    data = path.read_bytes()
+    path.write_bytes(data[:place] + bytes(40) + data[place + 40 :])
+    assert "cannot be read" in fault_of(Cell(20, -31), path)
+
+
+def test_a_collection_is_asked_for_ground_within_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A box that reached beyond its sides would be that of neighbours, and at 180 degrees no box of an API."""
+    there = [Cell(20, -31), Cell(179, 62), Cell(-180, 0), Cell(-1, -1)]
+
+    class Collection:
+        def __init__(self, address: str, *, allow_network: bool) -> None:
+            assert not allow_network
+
+        def items(self, box: tuple[float, float, float, float], name: str) -> Iterator[Any]:
+            west, south, east, north = box
+            for lon, lat in there:
+                if lon < west < east < lon + 1 and lat < south < north < lat + 1:
+                    own = Cell(lon, lat).name
+                    names = f"{own}.xml", f"{own}.tif"
+                    yield SimpleNamespace(assets=[SimpleNamespace(name=one, href=f"/cells/{one}") for one in names])
+
+    monkeypatch.setattr(sources, "Collection", Collection)
+    found = source_of("cells.json", allow_network=False).files([*there, Cell(21, -31)])
+    assert found == {cell: f"/cells/{cell.name}.tif" for cell in there}

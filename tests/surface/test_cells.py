@@ -156,6 +156,27 @@ def test_without_a_list_nobody_says_what_is_sea(bucket: PublicFolder, geoid: str
     assert "tileList.txt" in caught.value.remedy
 
 
+def test_land_is_what_one_of_the_two_public_lists_names(
+    bucket: PublicFolder, geoid: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The DEM of 90 m has land that is not in that of 30 m; without its list nobody knows what is sea."""
+    coarse, missing = tmp_path / "coarse", Cell(21, -30)
+    coarse.mkdir()
+    write_list(coarse, [missing], spacing=30)
+    land, sea = Extent(20.5, -29.5, 21.5, -29.4), Extent(19.5, -27.5, 19.6, -27.4)
+    with serving(coarse) as other:
+        monkeypatch.setattr(sources, "PUBLIC", bucket.address)
+        monkeypatch.setattr(sources, "PUBLIC_LAND", other.address)
+        with pytest.raises(CoverageError, match=f"no heights for this land: {missing.name}"):
+            found(bucket.address, land, geoid)
+        assert found(bucket.address, sea, geoid).provenance["sea_cells"] == [Cell(19, -28).name]
+        assert found(bucket.address, Extent(19.5, -30.5, 20.5, -29.5), geoid).provenance["sea_cells"] == []
+        (coarse / "tileList.txt").unlink()
+        local_cache.clear()
+        with pytest.raises(CoverageError, match="unknown whether this is sea"):
+            found(bucket.address, sea, geoid)
+
+
 def test_land_that_the_public_dem_withholds_is_not_sea(tmp_path: Path, geoid: str) -> None:
     """Of Armenia and Azerbaijan the list names no cell, and they lie high above the sea."""
     for cell in (Cell(42, 40), Cell(43, 42)):
