@@ -50,7 +50,7 @@ def read_parquet(path: str | os.PathLike[str]) -> Table:
     columns: dict[str, Any] = {}
     for name in frame.columns:
         plain = str(name).lower().replace("_", "")
-        ours = {"h": "h", "id": "id", "sigmaxy": "sigma_xy", **OF_HEIGHTS.aliases}.get(plain, plain)
+        ours = {"sigmaxy": "sigma_xy", **OF_HEIGHTS.aliases}.get(plain, plain)
         columns.setdefault(ours, frame[name])
         if plain in ALTIMETRY:
             altimetry(table)
