@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,26 @@ def test_a_point_without_a_height_gets_none_and_the_others_their_undulation(tmp_
     assert math.isnan(found[1])
     # Nothing has to be known of heights that are not there.
     assert np.isnan(read(tmp_path, "a,1,2,24.4,-33.65,", "EPSG:4326").ground[0, 2])
+
+
+def test_a_point_with_a_height_beyond_the_geoid_is_named(tmp_path: Path) -> None:
+    """The grid is from 33 to 34 degrees east and from 30 to 31 degrees north; its undulation is 20 m."""
+    geoid = tmp_path / "geoid.gtx"
+    geoid.write_bytes(struct.pack(">ddddii4f", 30.0, 33.0, 1.0, 1.0, 2, 2, *[20.0] * 4))
+    rows = "a,1,2,33.5,30.5,100\nb,3,4,36.0,30.5,{}\nc,5,6,33.6,30.4,300"
+    for height, found in (("200", None), ("", [120.0, np.nan, 320.0])):
+        if found is None:
+            with pytest.raises(DatumError, match="does not cover this point") as caught:
+                read(tmp_path, rows.format(height), "EPSG:4326", str(geoid))
+            assert (caught.value.file, caught.value.field) == (str(tmp_path / "p.csv"), "line 3")
+        else:
+            np.testing.assert_allclose(read(tmp_path, rows.format(height), "EPSG:4326", str(geoid)).ground[:, 2], found)
+
+
+@pytest.mark.parametrize("stated", ["OGC:CRS84", "EPSG:4979", "EPSG:4326"])
+def test_one_system_may_have_its_axes_in_another_order(tmp_path: Path, stated: str) -> None:
+    found = read(tmp_path, "a,1,2,24.4,-33.65,", "EPSG:4326", first=f"#CRS: {stated}\n")
+    assert found.ground[0, :2].tolist() == [24.4, -33.65]
 
 
 def test_every_column_that_a_ray_needs_is_filled(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_a_scalar_that_contradicts_a_covariance_is_refused_and_rounding_is_not()
     assert points.with_covariance_image(skew).covariance_image[0, 0, 1] == 1.0
 
 
-@pytest.mark.parametrize("groups", [[0], [0.5] * 6, [-2] * 6, ["a"] * 6, [[0] * 6]])
+@pytest.mark.parametrize("groups", [[0], [0.5] * 6, [-2] * 6, [-1, 0, 1, -2, 3, 4], ["a"] * 6, [[0] * 6]])
 def test_what_is_not_a_group_is_refused(groups: list[object]) -> None:
     with pytest.raises(InputError) as caught:
         replace(made(), groups=groups)

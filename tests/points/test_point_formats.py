@@ -18,7 +18,7 @@ from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.options import PointOptions
 from ortho_pipeline.points import Points, one_mark, read_points, write_points
-from ortho_pipeline.points.formats import read_block_table
+from ortho_pipeline.points.formats import names_image, read_block_table
 from ortho_pipeline.points.rows import MAX_FILE
 
 
@@ -314,6 +314,24 @@ def test_images_of_the_same_name_in_different_folders_are_kept_apart(tmp_path: P
     # Images of a folder that was renamed keep their points.
     path.write_text("id,image,col,row,x,y,h\nA,old/BAND.tif,1,2,500000,4000000,9\n")
     assert read_points(path, image_name=str(tmp_path / "new/BAND.tif"), **given).ids == ("A",)
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "same"),
+    [
+        ("BAND.tif", "/day/fore/BAND.tif", True), ("band.TIF", "/day/fore/BAND.tif", True),
+        ("fore\\BAND.tif", "/day/fore/BAND.tif", True), (" ./fore/BAND.tif ", "/day/fore/BAND.tif", True),
+        ("/day/fore/BAND.tif", "/day/fore/BAND.tif", True), ("../fore/BAND", "/day/fore/BAND.tif", True),
+        ("aft/BAND.tif", "/day/fore/BAND.tif", False), ("night/fore/BAND.tif", "/day/fore/BAND.tif", False),
+        ("fore/OTHER.tif", "/day/fore/BAND.tif", False), ("/more/day/fore/BAND.tif", "/day/fore/BAND.tif", False),
+        # A name without a suffix may have points of its own; another suffix is that of a converted image.
+        ("scene.v2", "/day/scene.v2.tif", True), ("scene.v2.jp2", "/day/scene.v2.tif", True),
+        ("scene", "/day/scene.v2.tif", False), ("scene.v2", "/day/scene.tif", True),
+        ("", "/day/BAND.tif", False), (".", "/day/BAND.tif", False),
+    ],
+)  # fmt: skip
+def test_a_name_means_an_image_if_all_of_its_folders_agree(name: str, image: str, same: bool) -> None:
+    assert names_image(name, image) is same
 
 
 def test_a_point_without_an_image_among_others_is_not_lost(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from ortho_pipeline.points import Points, read_points
 from ortho_pipeline.points.link_lists import odm_crs
 from ortho_pipeline.points.selection import assign_roles, select_control
 from ortho_pipeline.points.shared_marks import marks_warning, one_mark
+from ortho_pipeline.surface.accuracy import read_check_heights
 
 
 @pytest.mark.parametrize(
@@ -59,6 +60,17 @@ def test_a_row_of_a_link_table_is_below_the_axis(tmp_path: Path) -> None:
     path.write_text("link table\n5 1.01 24.5 -33.5\n")
     with pytest.raises(InputError, match=r"line 2, from-y.*must be minus the row"):
         read_points(path, crs="EPSG:4326")
+
+
+@pytest.mark.parametrize(("header", "row", "known"), [("x y h", "33.5 36.5 1042.5", True), ("x y", "33.5 36.5", False)])
+def test_three_names_are_a_header_whatever_the_suffix(tmp_path: Path, header: str, row: str, known: bool) -> None:
+    path = tmp_path / "heights.txt"
+    path.write_text(f"{header}\n{row}\n")
+    if known:
+        assert read_check_heights(path, "EPSG:4326", "ellipsoid")[0].tolist() == [[33.5, 36.5, 1042.5]]
+    else:
+        with pytest.raises(InputError, match="unknown format"):
+            read_check_heights(path, "EPSG:4326", "ellipsoid")
 
 
 def features(*properties: dict[str, Any], place: Any = (24.5, -33.5, 10.0)) -> str:

@@ -52,6 +52,19 @@ def test_tables_of_altimetry_say_what_they_are(tmp_path: Path, height: str, sigm
     assert crs.to_epsg() == 4326
 
 
+def test_altimetry_in_a_system_of_its_own(tmp_path: Path) -> None:
+    """Only columns that are named longitude and latitude have a system without a statement of one."""
+    path = tmp_path / "atl.csv"
+    path.write_text("x,y,h_mean,h_sigma\n500000,4000000,1042.5,0.2\n")
+    with pytest.raises(CrsError, match="CRS of these points is unknown"):
+        read_spot_heights(path)
+    ground, crs, _ = read_check_heights(path, "EPSG:32636")
+    assert (ground.tolist(), crs.to_epsg()) == ([[500000.0, 4000000.0, 1042.5]], 32636)
+    path.write_text("#CRS: EPSG:4258\nlongitude,latitude,h_mean,h_sigma\n33.5,36.5,1042.5,0.2\n")
+    ground, crs, _ = read_check_heights(path)
+    assert (ground.tolist(), crs.to_epsg()) == ([[33.5, 36.5, 1042.5]], 4258)
+
+
 def test_geojson(tmp_path: Path) -> None:
     features = [
         {"type": "Feature", "geometry": {"type": "Point", "coordinates": place}, "properties": properties}
@@ -119,6 +132,24 @@ def test_geoparquet(tmp_path: Path) -> None:
     geopandas.GeoDataFrame({"h": [1.0]}, geometry=places[:1].buffer(1), crs="EPSG:4326").to_parquet(path)
     with pytest.raises(InputError, match="not all points"):
         read_spot_heights(path)
+
+
+def test_heights_of_geoparquet_are_those_of_a_column_or_of_all_geometries(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    geopandas = pytest.importorskip("geopandas")
+    path, sigmas = tmp_path / "spots.parquet", {"sigma": [0.2, 0.4]}
+    places = geopandas.points_from_xy([33.5, 33.6], [36.5, 36.4], [1042.5, 1300.0])
+    flat = geopandas.points_from_xy([33.5, 33.6], [36.5, 36.4])
+    for columns, geometry, heights in (
+        (sigmas, places, [1042.5, 1300.0]), (sigmas | {"h": [7.0, 8.0]}, places, [7.0, 8.0]),
+        (sigmas, flat, None), (sigmas, [places[0], flat[1]], None),
+    ):  # fmt: skip
+        geopandas.GeoDataFrame(columns, geometry=geometry, crs="EPSG:4979").to_parquet(path)
+        if heights is None:
+            with pytest.raises(InputError, match="no column h"):
+                read_spot_heights(path)
+        else:
+            assert read_spot_heights(path).ground[:, 2].tolist() == heights
 
 
 def test_what_is_no_geoparquet_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

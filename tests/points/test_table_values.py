@@ -50,6 +50,16 @@ def test_a_point_of_a_table_has_its_own_values() -> None:
         assert sorted(one.sigma_alike for one in chosen) == [0.01, 0.04]
 
 
+def test_a_point_of_which_nothing_more_is_stated_is_control_on_exact_ground(tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text("id,col,row,x,y,h\n1,3,7,24,-33,10\n")
+    for found in (
+        read_points(tmp_path / "p.csv", crs="EPSG:4979"), Points.of([[3.0, 7.0]], [[24.0, -33.0, 10.0]], "EPSG:4979")
+    ):  # fmt: skip
+        (one,) = found
+        assert (one.id, one.role, one.sigma_image, one.sigma_ground) == ("1", "control", 0.5, (0.0, 0.0, 0.0))
+        assert (one.group, one.sigma_common, one.sigma_alike) == (-1, 0.0, 0.0)
+
+
 def test_a_point_without_a_height_has_no_geocentric_place() -> None:
     found = points().to_crs("EPSG:4978").ground
     assert np.isnan(found[4]).all()
@@ -107,8 +117,20 @@ def test_points_of_a_dataset_keep_their_names_if_all_have_one(names: tuple[str, 
     # A height of zero is one if another point has a height.
     np.testing.assert_array_equal(found.ground, [[24, -33, 0], [25, -33, 7]])
     assert found.sigma_image.tolist() == [0.5, 0.5]
-    gcps[1].GCPX = math.inf
-    with pytest.raises(InputError, match="not finite"):
+    for field, value, said in (
+        ("GCPX", math.inf, "not finite"), ("GCPLine", math.nan, "not finite"), ("GCPX", 25.0, None),
+        ("GCPPixel", 1.5, None),
+    ):  # fmt: skip
+        before = getattr(gcps[1], field)
+        setattr(gcps[1], field, value)
+        if said is None:
+            assert len(gcps_of_dataset(dataset, vertical="ellipsoid")) == 2
+        else:
+            with pytest.raises(InputError, match=said):
+                gcps_of_dataset(dataset, vertical="ellipsoid")
+        setattr(gcps[1], field, before)
+    gcps[1].GCPPixel, gcps[1].GCPLine = 1.5, 5.0
+    with pytest.raises(InputError, match="the same image coordinates as in GCP 1"):
         gcps_of_dataset(dataset, vertical="ellipsoid")
 
 
