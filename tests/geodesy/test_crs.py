@@ -40,6 +40,10 @@ def test_a_crs_in_words_and_as_it_is_read_again() -> None:
     own = pyproj.CRS.from_proj4("+proj=tmerc +lat_0=0 +lon_0=33 +k=0.9996 +x_0=400000 +y_0=0 +datum=WGS84 +no_defs")
     assert (crs_text(pyproj.CRS(32636)), crs_definition(pyproj.CRS(32636))) == ("EPSG:32636", "EPSG:32636")
     assert (own.name, crs_text(own)) == ("unknown", "custom Transverse Mercator")
+    # The shift of its datum is not what a system is called after.
+    bound = pyproj.CRS("+proj=tmerc +lon_0=33 +ellps=bessel +towgs84=598,73,418,0,0,0,0 +type=crs")
+    assert (bound.is_bound, crs_text(bound)) == (True, "custom Transverse Mercator")
+    assert crs_text(pyproj.CRS("+proj=longlat +ellps=bessel +type=crs")) == "custom geographic CRS"
     assert "\n" not in crs_definition(own)
     assert pyproj.CRS(crs_definition(own)) == own
 
@@ -310,6 +314,16 @@ def test_grids_for_the_doctor() -> None:
     info = proj_info()
     assert info["network"] is False
     assert info["search_path"]
+
+
+def test_the_network_of_proj_is_off_whatever_it_was_before() -> None:
+    """Results depend only on files."""
+    pyproj.network.set_network_enabled(True)
+    try:
+        module.add_system_grids()
+        assert not pyproj.network.is_network_enabled()
+    finally:
+        pyproj.network.set_network_enabled(False)
 
 
 # -- systems

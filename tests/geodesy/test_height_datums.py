@@ -51,6 +51,22 @@ def test_the_heights_of_a_compound_system_are_those_of_its_vertical_part() -> No
     assert Vertical.parse("EPSG:7423") == Vertical("EPSG:5621")
 
 
+def test_heights_are_in_the_unit_of_their_datum_and_undulations_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Vertical, "undulation", lambda self, lon, lat: np.array([-26.5, np.nan]))
+    for name, metres in (("EPSG:8228", 0.3048), ("EPSG:6360", 1200 / 3937), ("EPSG:5773", 1.0), ("ellipsoid", 1.0)):
+        found = Vertical(name).ellipsoidal([-97.0, 0.0], [30.0, 0.0], [500.0, 500.0])
+        np.testing.assert_allclose(found, [500.0 * metres - 26.5, np.nan], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("shift", "kept"), [(2.9, False), (-2.9, False), (3.1, True), (-3.1, True)])
+def test_heights_follow_another_realisation_up_to_three_metres(shift: float, kept: bool) -> None:
+    """On the equator at longitude 0 a shift along X is one of the height; a farther centre is that of another datum."""
+    text = f"+proj=tmerc +lon_0=0 +ellps=GRS80 +towgs84={shift},0,0 +type=crs"
+    there = GroundTransform("EPSG:4979", text)([[0.0, 0.0, 100.0]])
+    assert there[0, 2] == pytest.approx(100.0 if kept else 100.0 - shift, abs=1e-3)
+    np.testing.assert_allclose(GroundTransform(text, "EPSG:4979")(there), [[0.0, 0.0, 100.0]], atol=1e-3)
+
+
 def test_a_file_states_a_grid_by_its_name_and_not_by_a_path(tmp_path: Path) -> None:
     path = tmp_path / "geoid.gtx"
     path.write_bytes(struct.pack(">ddddii", 30.0, 33.0, 1.0, 1.0, 2, 2) + struct.pack(">4f", *[20.0] * 4))
