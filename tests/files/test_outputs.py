@@ -97,6 +97,26 @@ def test_the_renames_of_a_killed_command_are_completed(tmp_path: Path) -> None:
     assert contents(tmp_path) == {"a.txt": "new", "kept.txt": "old"}
 
 
+def test_outputs_that_cannot_be_cleared_up_are_not_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise a process would be told, at its next attempt, that another command is writing."""
+    made = Outputs(tmp_path.resolve(), "scene")
+    (tmp_path / f"{made.prefix}1.part").write_text("half")
+    made.lock_path.touch()
+    unlink = Path.unlink
+
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    for _ in range(2):
+        with pytest.raises(InputError, match="cannot write here"), together(tmp_path, "scene"):
+            pass
+    monkeypatch.setattr(Path, "unlink", unlink)
+    with together(tmp_path, "scene"):
+        write_text(tmp_path / "a.txt", "a")
+    assert contents(tmp_path) == {"a.txt": "a"}
+
+
 @pytest.mark.parametrize(("suffix", "kept"), [("." + "x" * 38, True), ("." + "x" * 39, False), ("", True)])
 def test_drivers_go_by_the_suffix_of_a_temporary_name(tmp_path: Path, suffix: str, kept: bool) -> None:
     with whole_or_nothing(tmp_path / f"a{suffix}") as temporary:

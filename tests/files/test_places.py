@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import tarfile
 import zipfile
@@ -188,6 +189,21 @@ def test_bytes_of_the_stores_client_and_of_gdal_are_added(monkeypatch: pytest.Mo
     assert traffic.bytes_read() == 149
     monkeypatch.setattr(gdal, "NetworkStatsGetAsSerializedJSON", lambda: "")
     assert traffic.bytes_read() == 107
+
+
+def test_what_gdal_read_before_it_counts_is_added_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """GDAL reads its switch again after a reset, and counts from zero."""
+    read = {"downloaded_bytes": 40}
+    monkeypatch.setattr(gdal, "NetworkStatsGetAsSerializedJSON", lambda: json.dumps({"methods": {"GET": read}}))
+    monkeypatch.setattr(gdal, "NetworkStatsReset", lambda: read.update(downloaded_bytes=0))
+    monkeypatch.setattr(traffic, "_own", [7])
+    monkeypatch.setenv(traffic._COUNTING, "")  # monkeypatch restores only what it has set or deleted
+    monkeypatch.delenv(traffic._COUNTING)
+    traffic.count_gdal()
+    assert (os.environ[traffic._COUNTING], traffic.bytes_read()) == ("YES", 47)
+    read["downloaded_bytes"] = 5
+    traffic.count_gdal()
+    assert traffic.bytes_read() == 52
 
 
 def test_a_class_in_a_document_is_text() -> None:

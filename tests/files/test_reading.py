@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import check_path
-from ortho_pipeline.files.reading import parse_json, read_bounded, read_json, states
+from ortho_pipeline.files.reading import parse_json, read_bounded, read_json, states, why_no_file
 
 
 def test_one_byte_more_than_the_limit_is_read(tmp_path: Path) -> None:
@@ -68,6 +69,17 @@ def test_the_most_similar_name_is_proposed(tmp_path: Path) -> None:
     assert str(tmp_path / "scene_2019.tif") in check_path(tmp_path / "scene_2018.tif")
     assert "dem" not in check_path(tmp_path / "points.csv")
     assert str(tmp_path / "none") in check_path(tmp_path / "none" / "dem.tif")
+    for pattern in ("*.tif", "scene_201?.tif"):
+        assert "so that the shell expands it" in check_path(tmp_path / pattern)
+
+
+def test_why_a_path_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").touch()
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("b.tif", "a.tif/b.tif", "a\0b"):
+        assert why_no_file(str(tmp_path / name)) == "there is no such file"
+    assert "cannot be read" in why_no_file(str(tmp_path / ("x" * 300)))
+    assert why_no_file(str(tmp_path / "pipe")) == "this is a pipe or a device"
 
 
 def test_a_state_has_the_size_and_no_file_has_none(tmp_path: Path) -> None:
