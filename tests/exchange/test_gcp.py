@@ -11,8 +11,10 @@ import pyproj
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.gcp import gcps_of_model, gcps_of_points, write_gcps
+from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.exchange.gcp import gcps_of_model, gcps_of_points, write_gcps, write_geolocation
+from ortho_pipeline.exchange.moved_grid import write_moved
+from ortho_pipeline.exchange.rpc import write_bare_vrt
 from ortho_pipeline.exchange.rpc_fit import box_grid, domain_box
 from ortho_pipeline.points import Points
 
@@ -75,6 +77,49 @@ def test_gdal_reads_the_points_and_nothing_that_it_would_prefer(tiny: Any, tmp_p
     assert made.GetGeoTransform(can_return_null=True) is None
     assert not made.GetMetadata("RPC")
     np.testing.assert_array_equal(made.ReadAsArray(), gdal.Open(str(tiny.image)).ReadAsArray())
+
+
+def test_a_vrt_finds_its_image_when_the_folder_of_both_moves(tiny: Any, tmp_path: Path) -> None:
+    (tmp_path / "one" / "out").mkdir(parents=True)
+    path, size = tmp_path / "one" / "source.tif", (tiny.width, tiny.height)
+    gdal.GetDriverByName("GTiff").CreateCopy(str(path), gdal.Open(str(tiny.image)))
+    source = gdal.Open(str(path))
+    write_gcps(source, gcps_of_model(tiny.model, size, side=3), tmp_path / "one" / "out" / "gcps.vrt")
+    write_geolocation(source, tiny.model, size, None, tmp_path / "one" / "out" / "arrays.vrt")
+    write_bare_vrt(source, tmp_path / "one" / "out" / "bare.vrt")
+    write_moved(source, (5e5, 2.0, 0.0, 4e6, 0.0, -2.0), tmp_path / "one" / "out" / "moved.vrt")
+    (tmp_path / "one").rename(tmp_path / "two")
+    for name in ("gcps", "arrays", "bare", "moved"):
+        found = gdal.Open(str(tmp_path / "two" / "out" / f"{name}.vrt")).ReadAsArray()
+        np.testing.assert_array_equal(found, gdal.Open(str(tiny.image)).ReadAsArray())
+
+
+@pytest.mark.parametrize(
+    ("name", "off", "same"),
+    [
+        ("GCPPixel", 5e-5, True), ("GCPLine", -5e-5, True), ("GCPPixel", 1.5e-4, False), ("GCPLine", -1.5e-4, False),
+        ("GCPX", -1.5e-4, False), ("GCPZ", 1.5e-4, False),
+    ],
+)  # fmt: skip
+def test_points_that_are_stored_elsewhere_are_not_left(
+    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, off: float, same: bool
+) -> None:
+    """One of nine, by more than a ten-thousandth of its unit: as if GDAL stored another number."""
+    gcps, original = gcps_of_model(tiny.model, (tiny.width, tiny.height), side=3), gdal.GCP
+
+    def changed(*numbers: Any) -> gdal.GCP:
+        made = original(*numbers)
+        if numbers and numbers[-1] == "4":
+            setattr(made, name, getattr(made, name) + off)
+        return made
+
+    monkeypatch.setattr(gdal, "GCP", changed)
+    if same:
+        write_gcps(gdal.Open(str(tiny.image)), gcps, tmp_path / "a.tif")
+    else:
+        with pytest.raises(ModelError, match="control points differ"):
+            write_gcps(gdal.Open(str(tiny.image)), gcps, tmp_path / "a.tif")
+    assert (tmp_path / "a.tif").exists() is same
 
 
 def test_the_grid_of_a_box_has_its_corners_and_steps() -> None:

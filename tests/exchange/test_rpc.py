@@ -16,7 +16,8 @@ from osgeo import gdal
 from products import til_text
 from real_data import data_folder
 
-from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors import InputError, ModelError, OrthoError
+from ortho_pipeline.exchange import rpc as rpc_module
 from ortho_pipeline.exchange.rpc import (
     export_rpc,
     files_of,
@@ -173,6 +174,22 @@ def test_text_is_read_again_to_the_last_bit(tmp_path, writer, name):
         assert same(read_rpc(tmp_path / name), rpc)
 
 
+@pytest.mark.parametrize("writer", [write_rpc_txt, write_rpb, write_sized_geom, write_rpc_xml])
+def test_text_is_known_by_its_content_whatever_its_suffix(tmp_path, writer):
+    rpc = make_rpc()
+    writer(rpc, tmp_path / "scene.metadata")
+    assert same(read_rpc(tmp_path / "scene.metadata"), rpc)
+
+
+@pytest.mark.parametrize(("writer", "name"), [(write_vrt, "b.vrt"), (write_tagged_copy, "b.tif")])
+def test_the_rpc_of_a_raster_is_read_from_it(tmp_path, writer, name):
+    """A VRT is text, too, with the names of an RPC's fields."""
+    rpc = make_rpc()
+    writer(gdal.Open(str(make_image(tmp_path / "a.tif"))), rpc, tmp_path / name)
+    found = read_rpc(tmp_path / name).ground_to_image(in_box(rpc, 50))
+    np.testing.assert_allclose(found, rpc.ground_to_image(in_box(rpc, 50)), atol=1e-6)
+
+
 @pytest.mark.parametrize("correction", ["shift", "scale"])
 @pytest.mark.parametrize("how", ["txt", "rpb", "tag", "vrt"])
 def test_gdal_reads_what_was_exported(tmp_path, how, correction):
@@ -274,6 +291,22 @@ def test_tagged_copy_refuses_a_side_car_that_would_win(tmp_path):
     with pytest.raises(InputError, match=r"b_RPC\.TXT"):
         write_tagged_copy(gdal.Open(str(make_image(tmp_path / "a.tif"))), make_rpc(), tmp_path / "b.tif")
     assert not (tmp_path / "b.tif").exists()
+
+
+@pytest.mark.parametrize(("change", "same"), [(0.0, True), (6e-10, True), (1.1e-9, False), (-1.1e-9, False)])
+@pytest.mark.parametrize(("writer", "name"), [(write_vrt, "out.vrt"), (write_tagged_copy, "out.tif")])
+def test_an_rpc_that_is_stored_as_another_is_not_left(tmp_path, monkeypatch, writer, name, change, same):
+    """As if GDAL stored another coefficient: at the sides, 1377.6 px from the middle, 8e-7 or 1.5e-6 px off."""
+    rpc, original, path = make_rpc(), rpc_module.rpc_metadata, tmp_path / name
+    other = rpc._replace(col_num=rpc.col_num + change * np.eye(20)[1])
+    image = gdal.Open(str(make_image(tmp_path / "a.tif")))
+    monkeypatch.setattr(rpc_module, "rpc_metadata", lambda _: original(other))
+    if same:
+        writer(image, rpc, path)
+    else:
+        with pytest.raises(ModelError, match=r"the written RPC is off by 1\.5\d*e-06 px"):
+            writer(image, rpc, path)
+    assert path.exists() is same
 
 
 # -- which RPC it is -------------------------------------------------------------------------------------------------
@@ -832,7 +865,7 @@ def test_a_side_car_that_gdal_cannot_read_is_named(tmp_path):
     for _ in range(2):
         dataset = gdal.Open(str(image))
         assert files_of(dataset)[0] == str(image)
-        with pytest.raises(InputError, match=r"scene_RPC\.TXT is damaged or encrypted"):
+        with pytest.raises(InputError, match=r"there is no RPC that can be read: scene_RPC\.TXT is damaged"):
             rpc_of_dataset(dataset)
     dataset = gdal.Open(str(image))
     assert has_rpc(dataset)

@@ -163,6 +163,25 @@ def test_a_moved_copy_keeps_what_is_in_side_cars(tmp_path, monkeypatch):
     assert band.GetDescription() == "nir"
 
 
+@pytest.mark.parametrize("overviews", [False, True])
+def test_a_copy_has_the_mask_next_to_the_ortho_with_and_without_overviews(tmp_path, monkeypatch, overviews):
+    pixels = np.random.default_rng(6).integers(1, 255, (60, 90), dtype=np.uint8)
+    monkeypatch.setenv("GDAL_TIFF_INTERNAL_MASK", "NO")
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 90, 60, 1)
+    made.SetGeoTransform((5e5, 2.0, 0.0, 4e6, 0.0, -2.0))
+    made.WriteArray(pixels)
+    made.CreateMaskBand(gdal.GMF_PER_DATASET)
+    made.GetRasterBand(1).GetMaskBand().WriteArray(np.where(pixels % 60 < 30, 255, 0).astype(np.uint8))
+    del made
+    if overviews:
+        gdal.Open(str(tmp_path / "a.tif")).BuildOverviews("NEAREST", [2])
+    assert (tmp_path / "a.tif.ovr").exists() is overviews
+    write_moved(gdal.Open(str(tmp_path / "a.tif")), (5e5 + 7, 2.0, 0.0, 4e6, 0.0, -2.0), tmp_path / "b.tif")
+    copy = gdal.Open(str(tmp_path / "b.tif"))
+    np.testing.assert_array_equal(copy.ReadAsArray(), pixels)
+    np.testing.assert_array_equal(copy.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0, pixels % 60 < 30)
+
+
 def test_a_geotransform_is_moved_along_its_own_axes():
     rotated = (1000.0, 3.0, 4.0, 2000.0, 4.0, -3.0)
     moved = moved_geotransform(rotated, np.array([2.0, -1.0]))
