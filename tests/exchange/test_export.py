@@ -16,11 +16,13 @@ from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.heights.opening import open_surface
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.export import FORMATS
+from ortho_pipeline.exchange.export import FORMATS, Export
 from ortho_pipeline.exchange.gcp import write_geolocation
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options import PointOptions, SurfaceOptions
+from ortho_pipeline.points import Points
+from ortho_pipeline.surface.flat import FlatSurface
 
 REAL_RPCS = (
     "gdal/gcore/data/md_ov_rpc.txt",
@@ -314,6 +316,47 @@ def test_the_error_between_samples_of_geolocation_arrays_is_the_largest(tmp_path
     columns = np.arange(257) * 4.0
     np.testing.assert_allclose(arrays[0, 7], 20.0 + Bent.a * columns + Bent.b * columns**2, atol=1e-12)
     np.testing.assert_allclose(arrays[1, :, 9], -30.0 - Bent.a * 4 * np.arange(129), atol=1e-12)
+
+
+def test_the_summary_tells_what_each_file_is_and_how_well_it_fits(tiny, tmp_path):
+    nothing = Points.of(np.zeros((0, 2)), np.zeros((0, 3)), "EPSG:4979")
+    size, image = (tiny.width, tiny.height), gdal.Open(str(tiny.image))
+    export = Export(image, tiny.model, size, FlatSurface(700.0), nothing)
+    assert export.summary("rpc", "a.tif", []).splitlines() == ["Model rpc of a.tif"]
+    for name in ("gcp", "geolocation", "rpb"):
+        export.write(FORMATS[name], tmp_path / f"a{FORMATS[name].ending}")
+    head, rpc, gcps, arrays = export.summary("rpc", "a.tif", [FORMATS["gcp"], FORMATS["rpb"]]).splitlines()
+    assert (head, rpc) == ("Model rpc of a.tif", "RPC: exact")
+    assert gcps == "Control points: 121, a grid at 700 m above the ellipsoid"
+    worst = f"{export.document['geolocation']['max_error_px']:.2g}"
+    assert arrays == f"Geolocation: the model at 700 m above the ellipsoid, {worst} px off between its samples"
+    # Without a surface the points are at the height in the middle of the model.
+    plain = Export(image, tiny.model, size, None, nothing, [("p4", "gross error")])
+    plain.write(FORMATS["gcp"], tmp_path / "b_gcp.vrt")
+    middle = f"at {tiny.model.reference_height:.0f} m above the ellipsoid"
+    assert plain.summary("rpc", "a.tif", []).splitlines()[1:] == [f"Control points: 121, a grid {middle}"]
+
+
+def test_the_summary_tells_how_far_off_a_fitted_rpc_is(tmp_path):
+    camera = FrameCamera()
+    export = Export(gdal.GetDriverByName("MEM").Create("", 9, 9), camera, (9, 9), None, None)
+    worst = export.rpc.max_error_px
+    assert 0 < worst < 0.001
+    _, line = export.summary("frame", "a.tif", []).splitlines()
+    assert line.startswith("RPC: refitted, at most ")
+    assert float(line.split()[4]) == pytest.approx(worst, rel=0.06)
+
+
+@pytest.mark.parametrize(("size", "step"), [((1022, 510), 4), ((100, 513), 3), ((257, 100), 2), ((256, 33), 1)])
+def test_geolocation_arrays_reach_the_last_pixel_with_at_most_257_samples(tmp_path, size, step):
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "image.tif"), *size, 1)
+    write_geolocation(made, Bent(), size, None, tmp_path / "g.vrt")
+    told = gdal.Open(str(tmp_path / "g.vrt")).GetMetadata("GEOLOCATION")
+    assert [told[f"{name}_STEP"] for name in ("PIXEL", "LINE")] == [str(step)] * 2
+    arrays = gdal.Open(told["X_DATASET"])
+    for count, side in zip((arrays.RasterXSize, arrays.RasterYSize), size, strict=True):
+        assert count <= 257
+        assert (count - 2) * step < side <= (count - 1) * step
 
 
 # -- command line ----------------------------------------------------------------------------------------------------

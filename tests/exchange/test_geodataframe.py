@@ -79,6 +79,16 @@ def test_frames_of_others_say_what_their_heights_are(points):
         op.from_geodataframe(frame.set_crs(None, allow_override=True), vertical="ellipsoid")
 
 
+def test_a_row_without_a_height_has_none_where_there_is_a_column_of_heights():
+    frame = geopandas.GeoDataFrame(
+        {"col": [10, 20.5], "row": [3, 4], "h": [None, 5.5]},
+        geometry=geopandas.points_from_xy([33.3, 33.4], [37.2, 37.3], [800.0, 900.0]), crs="EPSG:4326",
+    )  # fmt: skip
+    found = op.from_geodataframe(frame, vertical="ellipsoid")
+    np.testing.assert_array_equal(found.ground[:, 2], [np.nan, 5.5])
+    assert op.from_geodataframe(frame.drop(columns="h"), vertical="ellipsoid").ground[:, 2].tolist() == [800.0, 900.0]
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -89,6 +99,7 @@ def test_frames_of_others_say_what_their_heights_are(points):
         (lambda f: f.assign(group=0.5), "row 0, group: 0.5 is not a group"),
         (lambda f: f.assign(id="A"), "two points have the id 'A'"),
         (lambda f: f.set_geometry(f.buffer(1.0)), "Polygon is not a point"),
+        (lambda f: f.set_geometry(geopandas.GeoSeries.from_wkt(["POINT EMPTY"] * 8, crs=f.crs)), "is not a point"),
         (lambda f: f.drop(columns="geometry"), "DataFrame has no geometry"),
         (
             lambda f: geopandas.GeoDataFrame(f.rename(columns={"h": "col"}), geometry="geometry"),

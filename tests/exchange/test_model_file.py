@@ -11,6 +11,9 @@ import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
+from ortho_pipeline.models import FrameCamera
+from ortho_pipeline.models.frame.camera import MAP
+from ortho_pipeline.models.lens import Interior
 
 GAUGE, POINTS, PARAMETERS = {"gauge": "free"}, {"points": [{"id": "a"}]}, {"parameters": {"col": {"value": 1.0}}}
 
@@ -56,3 +59,17 @@ def test_what_is_no_model_file_is_refused(tiny: Any, tmp_path: Path, change: Any
         read_model_file(path)
     assert (caught.value.file, caught.value.field) == (str(path), field)
     assert caught.value.remedy
+
+
+@pytest.mark.parametrize(("omega", "sees"), [(0.0, True), (np.pi, False)])
+def test_a_camera_that_looks_at_the_sky_is_refused(tmp_path: Path, omega: float, sees: bool) -> None:
+    interior, exterior = Interior(1000, 668, 0.01, 1e-5, 1e-5), [300_000.0, 2_700_000.0, 2000.0, omega, 0.0, 0.0]
+    model = FrameCamera.from_map(interior, "EPSG:32651", exterior, frame=MAP, heights=(0.0, 100.0))
+    path = tmp_path / "a_model.json"
+    write_model_file(SavedModel(model), path)
+    if sees:
+        assert read_model_file(path).model.height_range == pytest.approx((0.0, 100.0))
+        return
+    with pytest.raises(InputError, match=r"maps no ground|not finite") as caught:
+        read_model_file(path)
+    assert (caught.value.file, caught.value.field) == (str(path), "model")
