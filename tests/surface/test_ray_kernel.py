@@ -121,6 +121,26 @@ def test_bounds_are_those_of_their_squares():
     np.testing.assert_array_equal(found.tops, expected)
 
 
+@pytest.mark.parametrize("axis", [0, 1], ids=["columns", "rows"])
+@pytest.mark.parametrize("way", [-1, 1])
+def test_a_needle_far_ahead_of_a_ray_counts(axis, way):
+    """Rays go a sample per metre upwards, through 100 m; the needle is 60 samples ahead of the last square."""
+    heights = np.zeros((65, 65))
+    needle, start = [36, 36], [4, 4]
+    needle[1 - axis], start[1 - axis] = (4, 7) if way < 0 else (60, 0)
+    heights[tuple(needle)] = 100.0
+    node = np.zeros((1, 10))
+    node[0, 1 + 5 * axis] = way * 50.0
+    found = ray_kernel.terrain_of(heights, 0, 0, 0.0, 50.0, node)
+    assert found.steep[tuple(start)] == 100.0
+    # Behind a ray it does not.
+    start[1 - axis] = 0 if way < 0 else 7
+    needle[1 - axis] = 60 if way < 0 else 4
+    heights = np.zeros((65, 65))
+    heights[tuple(needle)] = 100.0
+    assert ray_kernel.terrain_of(heights, 0, 0, 0.0, 50.0, node).steep[tuple(start)] == -np.inf
+
+
 def test_rays_of_gentle_terrain_are_not_followed_cell_by_cell(monkeypatch):
     """Nothing in it climbs as fast as rays 20 degrees off the vertical: where they are on it, they first meet it."""
     heights = terrain("rough")
