@@ -231,7 +231,7 @@ OTHERWISE: Mapping[str, Mapping[str, str]] = {
 def main(folder: Path = FOLDER) -> None:
     """Write all pages, and remove those of commands that are no more."""
     folder.mkdir(exist_ok=True)
-    root = click.Context(cli, info_name="ortho")
+    root = click.Context(cli, info_name="ortho", **cli.context_settings)
     pages = {f"{name}.md": page(_below(root, name)) for name in cli.list_commands(root)}
     for old in folder.glob("*.md"):
         if old.name not in pages:

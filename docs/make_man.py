@@ -32,7 +32,7 @@ def main(folder: Path = FOLDER) -> None:
 
 def contexts(context: click.Context | None = None) -> Iterator[click.Context]:
     """Return the program and all of its commands, each with its words."""
-    context = context or click.Context(cli, info_name="ortho")
+    context = context or click.Context(cli, info_name="ortho", **cli.context_settings)
     yield context
     if isinstance(context.command, click.Group):
         for name in context.command.list_commands(context):

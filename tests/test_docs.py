@@ -75,7 +75,7 @@ def with_tinysat(monkeypatch):
 @pytest.mark.parametrize("line", COMMANDS)
 def test_commands_are_understood(line):
     words = shlex.split(line.split(" | ")[0], comments=True)[1:]
-    command, context = cli, click.Context(cli, info_name="ortho")
+    command, context = cli, click.Context(cli, info_name="ortho", **cli.context_settings)
     while isinstance(command, click.Group):
         name, words = words[0], words[1:]
         found = command.get_command(context, name)
