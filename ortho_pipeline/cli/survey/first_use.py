@@ -113,16 +113,17 @@ def _heights_text(document: Mapping[str, Any]) -> str:
 
 
 def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
-    from ortho_pipeline.commands.survey.folder import survey
+    from ortho_pipeline.commands.survey.folder import bundle_in, survey
 
     seen = survey(folder, scene)
+    steps = next_steps(seen, bundle_in(seen, scene))
     if as_json:
-        return print_json({**seen.to_json(), "next": next_steps(seen)})
+        return print_json({**seen.to_json(), "next": steps})
     wide = max([0, *(len(file.path) for file in seen.found)])
     for file in seen.found:
         say(f"{file.kind:<12} {file.path:<{wide}}   {file.said}")
     say("\nNext:" if seen.found else "Next:")
-    for line in next_steps(seen):
+    for line in steps:
         say(f"  {line}")
     return None
 
@@ -173,8 +174,8 @@ def _control_of(seen: FolderSurvey, scene: str, block: Sequence[str]) -> tuple[l
     return [note], []
 
 
-def next_steps(seen: FolderSurvey) -> list[str]:
-    """Return the next steps for the files of a folder: sentences, and commands to paste."""
+def next_steps(seen: FolderSurvey, bundle: tuple[str, str] | None) -> list[str]:
+    """Return the next steps for the files of a folder, which may be a bundle: sentences, and commands to paste."""
     from ortho_pipeline.commands.survey.folder import NO_DATUM
 
     scenes, images = seen.of("scene"), seen.of("image")
@@ -185,7 +186,7 @@ def next_steps(seen: FolderSurvey) -> list[str]:
     if not scenes:
         return _without_models(seen, images) if images else _without_images(seen)
     # Points of a block are for both images; a bundle has those of its panchromatic image.
-    bundle = None if seen.beside(scenes[0], "block points") else seen.bundle
+    bundle = None if seen.beside(scenes[0], "block points") else bundle
     scenes = scenes if bundle is None else [bundle[0]]
     dems = seen.beside(scenes[0], "dem")
     notes, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]

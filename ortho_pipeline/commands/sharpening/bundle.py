@@ -27,6 +27,7 @@ from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.geodesy.crs import ground_transform, map_crs
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, SensorModel
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.correction import COEFFICIENTS
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.pansharpened import colour_bands
@@ -119,8 +120,7 @@ def find_bundle(
             return None
         sharp, wide = inputs.open_scene(pan, options), inputs.open_scene(colours, options)
         taken_over(sharp.model, wide)
-        middle = wide.model.image_to_ground(np.array([[wide.width / 2, wide.height / 2]]), wide.model.reference_height)
-        image = sharp.model.ground_to_image(ground_transform(wide.model.crs, sharp.model.crs)(middle))
+        image = sharp.model.ground_to_image(ground_transform(wide.model.crs, sharp.model.crs)(_middle(wide)))
     except OrthoError:
         return None
     return (pan, colours) if ((image >= 0) & (image <= [sharp.width, sharp.height])).all() else None
@@ -137,8 +137,9 @@ def _refuse_options(
             remedy="make each ortho in its own folder, and sharpen the orthos",
         )
     for name in _OF_ONE:
-        # "tag" and "sidecar" choose the RPC of any image.
-        if getattr(scene, name) not in (None, "tag", "sidecar"):
+        # These words choose the RPC of any image.
+        common = name == "rpc" and scene.rpc in ("tag", "sidecar")
+        if getattr(scene, name) is not None and not common:
             raise InputError(
                 Text(Setting(f"scene.{name}"), " opens one image, and these are two"),
                 field=f"scene.{name}",
@@ -190,6 +191,11 @@ def _ratio_in(grid: Grid, model: SensorModel, scene: Scene, option: str = "outpu
     return round(float(ratio))
 
 
+def _middle(scene: Scene) -> Array:
+    """Return the ground ``(1, 3)`` in the middle of a scene, at its reference height."""
+    return scene.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), scene.model.reference_height)
+
+
 def taken_over(adjusted: SensorModel, scene: Scene) -> SensorModel:
     """Return the model of a scene with the correction of the panchromatic model.
 
@@ -199,7 +205,7 @@ def taken_over(adjusted: SensorModel, scene: Scene) -> SensorModel:
         If the scene does not show the place of the panchromatic image, or is not coarser.
     """
     delivered = adjusted.model if isinstance(adjusted, ImageCorrection) else adjusted
-    middle = scene.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), scene.model.reference_height)
+    middle = _middle(scene)
     there = ground_transform(scene.model.crs, delivered.crs)(middle)
     # Pixels in a square metre of the ground; NaN where a model does not reach.
     with np.errstate(invalid="ignore"):

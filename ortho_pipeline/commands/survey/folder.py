@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -85,14 +85,10 @@ class SurveyedFile:
 
 @dataclass(frozen=True)
 class FolderSurvey:
-    """The contents of a folder.
-
-    `bundle` has its panchromatic and its multispectral scene, if these two are all.
-    """
+    """The contents of a folder."""
 
     folder: Path
     found: tuple[SurveyedFile, ...]
-    bundle: tuple[str, str] | None = None
 
     def of(self, kind: Kind) -> list[str]:
         """Return the paths of a kind, from the folder."""
@@ -152,11 +148,11 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
             remedy="give the folder of one delivery, or write the pipeline file yourself (docs/run.md)",
         )
     files = [file for path in names if (file := _looked_at(path, place, options)) is not None]
-    seen = FolderSurvey(place, tuple(_without_parts(files)))
-    return replace(seen, bundle=_bundle(seen, options))
+    return FolderSurvey(place, tuple(_without_parts(files)))
 
 
-def _bundle(seen: FolderSurvey, options: SceneOptions) -> tuple[str, str] | None:
+def bundle_in(seen: FolderSurvey, options: SceneOptions) -> tuple[str, str] | None:
+    """Return the panchromatic and the multispectral scene of a folder, if these two are all; else None."""
     if len(scenes := seen.of("scene")) != 2:
         return None
     found = find_bundle((seen.folder / scenes[0], seen.folder / scenes[1]), options)
