@@ -76,6 +76,7 @@ _CAMERA = {
     "focal_length": ("focal length", "mm"),
     "x0": ("principal point x", "mm"),
     "y0": ("principal point y", "mm"),
+    "pitch_y": ("height of a pixel", "mm"),
     **{name: (f"radial distortion {name}", "") for name in ("k1", "k2", "k3")},
     **{name: (f"tangential distortion {name}", "") for name in ("p1", "p2")},
 }

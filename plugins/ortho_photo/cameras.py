@@ -79,10 +79,12 @@ class PhotoCamera:
     @property
     def sigmas(self) -> dict[str, float]:
         """Standard deviations of parameters of the interior orientation, in their units."""
-        metres = self.interior.focal_length
-        return {
+        metres, frame = self.interior.focal_length, self.interior
+        found = {
             name: part * metres if name in ("focal_length", "x0", "y0") else part for name, part in self.known.items()
         }
+        # Pixels are square. A calibration with two focal lengths says otherwise, and is not always right.
+        return found if frame.pitch_x == frame.pitch_y else found | {"pitch_y": abs(frame.pitch_y - frame.pitch_x)}
 
 
 def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -> PhotoCamera:

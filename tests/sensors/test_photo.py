@@ -329,6 +329,17 @@ def test_photos_share_the_camera_with_sigmas_of_its_source(tmp_path):
     assert fixed.model.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
 
 
+@pytest.mark.parametrize(("focal_lengths", "sigma"), [("402,400", 0.005), ("399,400", 0.0025)])
+def test_a_calibration_with_pixels_that_are_not_square_is_uncertain_by_that(tmp_path, focal_lengths, sigma):
+    data = f"2018-09-07;{focal_lengths},0,0,0,0,0,0,0"
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, "drone-dji:DewarpData": data}), calibrate="yes")
+    prior, interior = scene.priors["pitch_y"], scene.model.interior
+    assert prior.shared
+    assert prior.mean == interior.pitch_y != interior.pitch_x
+    assert prior.sigma == pytest.approx(sigma * interior.pitch_x)
+    assert abs(prior.mean - interior.pitch_x) == pytest.approx(prior.sigma)
+
+
 # -- cameras ---------------------------------------------------------------------------------------------------------
 
 

@@ -91,6 +91,26 @@ def test_photos_by_their_tags_alone_fit_and_are_where_opendronemap_has_them(real
     check_neighbours(orthos)
 
 
+def test_the_camera_is_that_of_opendronemap_within_its_sigmas(real, tmp_path):
+    """OpenDroneMap had the whole flight, and square pixels. DJI states pixels that are 0.18 % higher than wide."""
+    project = real / "orthority" / "odm"
+    report, _ = adjusted(project, tmp_path, dem_heights="off")
+    (theirs,) = json.loads((project / "opensfm" / "reconstruction.json").read_text())[0]["cameras"].values()
+    longer = 5472e-6  # m: the longer side of the sensor; a photo does not state it, so 1 px counts as 1 µm
+    wanted = {
+        "focal_length": theirs["focal_x"] * longer,
+        "x0": theirs["c_x"] * longer,
+        "y0": -theirs["c_y"] * longer,
+        "pitch_y": longer / theirs["width"],
+        **{name: theirs[name] for name in ("k1", "k2", "k3", "p1", "p2")},
+    }
+    found = {one["name"]: one for one in report["adjustment"]["shared_parameters"]}
+    assert set(found) == set(wanted)
+    for name, value in wanted.items():
+        assert abs(found[name]["value"] - value) < 3 * found[name]["sigma"], name
+    assert found["pitch_y"]["chance"] < 0.001
+
+
 def test_orthos_are_those_of_opendronemap_if_its_dsm_is_the_datum(real, tmp_path):
     """The DSM is from the reconstruction. By default its bias is estimated, and orthos are up to 2.7 px apart."""
     project = real / "orthority" / "odm"
