@@ -74,8 +74,7 @@ _SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
 #: What parameters of a camera are called, with the unit in which people read lengths.
 _CAMERA = {
     "focal_length": ("focal length", "mm"),
-    "x0": ("principal point x", "mm"),
-    "y0": ("principal point y", "mm"),
+    **{f"{axis}0": (f"principal point {axis}", "mm") for axis in "xy"},
     "pitch_y": ("height of a pixel", "mm"),
     **{name: (f"radial distortion {name}", "") for name in ("k1", "k2", "k3")},
     **{name: (f"tangential distortion {name}", "") for name in ("p1", "p2")},

@@ -112,7 +112,7 @@ def test_the_camera_is_that_of_opendronemap_within_its_sigmas(real, tmp_path):
 
 
 def test_orthos_are_those_of_opendronemap_if_its_dsm_is_the_datum(real, tmp_path):
-    """The DSM is from the reconstruction. By default its bias is estimated, and orthos are up to 2.7 px apart."""
+    """The DSM is from the reconstruction. By default its bias is estimated, and orthos are up to 2.8 px apart."""
     project = real / "orthority" / "odm"
     report, orthos = adjusted(project, tmp_path / "tags", dem_bias=0.0, dem_shift_sigma=0.0)
     check_places(project, tmp_path / "tags", report)
