@@ -109,6 +109,23 @@ def test_the_sigma_is_found_where_nobody_states_it(tmp_path: Path) -> None:
     assert any(notice.code == "dem-sigma-by-default" for notice in fit.warnings)
 
 
+def test_the_sigma_that_is_found_does_not_depend_on_how_many_ties_there_are(tmp_path: Path) -> None:
+    """The ties are five times better than stated, and the DEM as good: their sigma is all that heights can be told by.
+
+    With a limit of so many ties only, more of them made the sigma of the same DEM smaller.
+    """
+    found = []
+    for ties in (200, 800):
+        block = fly(Chain(convergence_deg=20.0, noise=0.02, ties=ties), 1)
+        points = replace(block.points, sigma_image=np.full(len(block.points.point), 0.1))
+        surface = dem(block, tmp_path / f"{ties}.tif", 1, white=0.02)
+        fit = adjust(block.start, points, heights=DemHeights(surface, bias=0.0, shift=0.0))
+        assert fit.heights is not None
+        assert fit.heights.sigma_is == "estimated"
+        found.append(fit.heights.sigma_m)
+    assert found[1] == pytest.approx(found[0], rel=0.25)
+
+
 def test_residuals_do_not_tell_the_sigma_of_correlated_errors(tmp_path: Path) -> None:
     """The shared errors contain them: what is left, 0.01 m, is no accuracy of the DEM."""
     block = fly(Chain(images=3, convergence_deg=10.0, ties=90), 3)

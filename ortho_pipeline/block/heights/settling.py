@@ -263,6 +263,9 @@ class Heights:
             return self
         redundancy = variances / self.sigma**2
         testable = used & (redundancy > _REDUNDANT)
+        if 2 * np.count_nonzero(testable) < np.count_nonzero(used):
+            # Most ties are less exact than this sigma. The few best would make it ever smaller.
+            testable[:] = False
         scaled = np.abs(residuals[testable]) / np.sqrt(redundancy[testable])
         if self.spots is not None:
             scaled = np.concatenate([scaled, self.sigma * self.spots.standardised(self.common, self.sigma)])
