@@ -52,7 +52,7 @@ def adjusted(project: Path, folder: Path, **block: Any) -> tuple[dict[str, Any],
         folder,
         BlockOptions(ties="auto", **block),
         SceneOptions(sensor="photo", sensor_options={"vertical": "ellipsoid"}),
-        match=MatchOptions(search=10.0, points=150),
+        match=MatchOptions(search=10.0),
         surface=surface_of(project),
         orthos=OUTPUT,
     )
@@ -84,11 +84,26 @@ def check_neighbours(orthos: dict[str, Path]) -> None:
     assert max(known) < 1.0
 
 
+def check_orthos(project: Path, folder: Path, orthos: dict[str, Path]) -> None:
+    """Compare the orthos with those by OpenDroneMap's reconstruction."""
+    for image in sorted((project / "images").glob("*.tif")):
+        theirs = rectify(
+            image,
+            folder,
+            scene=SceneOptions(sensor_options={"vertical": "ellipsoid"}),
+            surface=surface_of(project),
+            output=OUTPUT,
+        )
+        assert theirs.document["report"]["scene"]["sensor"] == "odm"
+        assert shift(orthos[image.stem], theirs.files["ortho"])[0] < 2.0
+
+
 def test_photos_by_their_tags_alone_fit_and_are_where_opendronemap_has_them(real, tmp_path):
     project = real / "orthority" / "odm"
-    report, orthos = adjusted(project, tmp_path)
-    check_places(project, tmp_path, report)
+    report, orthos = adjusted(project, tmp_path / "tags")
+    check_places(project, tmp_path / "tags", report)
     check_neighbours(orthos)
+    check_orthos(project, tmp_path / "odm", orthos)
 
 
 def test_the_camera_is_that_of_opendronemap_within_its_sigmas(real, tmp_path):
@@ -112,18 +127,9 @@ def test_the_camera_is_that_of_opendronemap_within_its_sigmas(real, tmp_path):
 
 
 def test_orthos_are_those_of_opendronemap_if_its_dsm_is_the_datum(real, tmp_path):
-    """The DSM is from the reconstruction. By default its bias is estimated, and orthos are up to 2.8 px apart."""
+    """The DSM is from the reconstruction, so it has no bias and no shift. By default both are estimated."""
     project = real / "orthority" / "odm"
     report, orthos = adjusted(project, tmp_path / "tags", dem_bias=0.0, dem_shift_sigma=0.0)
     check_places(project, tmp_path / "tags", report)
     check_neighbours(orthos)
-    for image in sorted((project / "images").glob("*.tif")):
-        theirs = rectify(
-            image,
-            tmp_path / "odm",
-            scene=SceneOptions(sensor_options={"vertical": "ellipsoid"}),
-            surface=surface_of(project),
-            output=OUTPUT,
-        )
-        assert theirs.document["report"]["scene"]["sensor"] == "odm"
-        assert shift(orthos[image.stem], theirs.files["ortho"])[0] < 2.0
+    check_orthos(project, tmp_path / "odm", orthos)
