@@ -261,12 +261,7 @@ class Heights:
         # Correlated errors are in the shared ones, so the residuals do not show them.
         if self.source.correlation is not None:
             return self
-        redundancy = variances / self.sigma**2
-        testable = used & (redundancy > _REDUNDANT)
-        if 2 * np.count_nonzero(testable) < np.count_nonzero(used):
-            # Most ties are less exact than this sigma. The few best would make it ever smaller.
-            testable[:] = False
-        scaled = np.abs(residuals[testable]) / np.sqrt(redundancy[testable])
+        scaled = _told(residuals[used], variances[used] / self.sigma**2)
         if self.spots is not None:
             scaled = np.concatenate([scaled, self.sigma * self.spots.standardised(self.common, self.sigma)])
         if len(scaled) < _ENOUGH:
@@ -302,6 +297,17 @@ class Heights:
         if self.stated is not None:
             return "enlarged" if self.scale > 1.0 else "stated"
         return "estimated" if self.estimated else "assumed"
+
+
+def _told(residuals: Array, redundancy: Array) -> Array:
+    """Return residuals ``(n,)`` of enough redundancy, over its root; none if most ties are less exact than the DEM.
+
+    The few best ties would make its sigma ever smaller.
+    """
+    testable = redundancy > _REDUNDANT
+    if 2 * np.count_nonzero(testable) < len(testable):
+        return np.zeros(0)
+    return np.asarray(np.abs(residuals[testable]) / np.sqrt(redundancy[testable]))
 
 
 def _breaking(heights: Heights, solved: Solved) -> Mask:
