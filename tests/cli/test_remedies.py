@@ -543,6 +543,17 @@ def _bands(printed: Printed, folder: Path) -> None:
     assert gdal.Open(str(folder / "ms.vrt")).RasterCount == 4
 
 
+@case("commands", "gdal_translate -unscale")
+def _with_an_offset(printed: Printed, folder: Path) -> None:
+    pan = folder / "pan.tif"
+    made = gdal.Translate(str(pan), str(SAMPLE / "reference.tif"))
+    made.GetRasterBand(1).SetOffset(-0.1)
+    made = None
+    printed.paste(refused(sharpen, pan, pan, folder / "out"))
+    unscaled = gdal.Open(str(folder / "pan_unscaled.tif"))
+    assert not unscaled.GetRasterBand(1).GetOffset()
+
+
 def _sharpened_badly(folder: Path, ratio: int | None) -> str:
     pan, coarse = folder / "pan.tif", folder / "ms.tif"
     gdal.Translate(str(pan), str(SAMPLE / "reference.tif"), srcWin=[100, 100, 400, 400])

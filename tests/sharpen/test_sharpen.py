@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -300,6 +301,37 @@ def test_wrong_pairs_are_refused(tmp_path: Path) -> None:
     right = write(tmp_path / "right.tif", np.where(east, wide, 0), 2.0, nodata=0)
     assert "no valid pixels in common" in refused(left, right, *out)
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("*.tif"))
+
+
+@pytest.mark.parametrize("of", ["pan", "ms"])
+def test_values_with_an_offset_are_refused_and_the_remedy_works(
+    of: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reflectance is scale x value + offset: ratios of these values are not those of the light."""
+    bundle = Bundle(side=256)
+    monkeypatch.chdir(tmp_path)
+    sharp, wide = bundle.pixels()
+    pixels, size = {"pan": (sharp[None], 0.5), "ms": (wide, 2.0)}[of]
+    names = {"pan": bundle.write(tmp_path)[0].name, "ms": "ms.tif"}
+    plain = run("sharpen", *names.values(), "-o", "plain")
+    assert plain.exit_code == 0, plain.output
+    raised = gdal.Open(str(write(tmp_path / names[of], pixels + 1000, size)), gdal.GA_Update)
+    for number in range(raised.RasterCount):
+        raised.GetRasterBand(number + 1).SetScale(1e-4)
+        raised.GetRasterBand(number + 1).SetOffset(-0.1)
+    raised = None
+    text = refused(*names.values(), "-o", "out")
+    assert f"{of}.tif: offset: the values of this image have an offset" in text
+    subprocess.run(text.split("`")[1].split(), check=True, capture_output=True)
+    names[of] = f"{of}_unscaled.tif"
+    done = run("sharpen", *names.values(), "-o", "out")
+    assert done.exit_code == 0, done.output
+    scale = 1e-4 if of == "ms" else 1.0
+    first, second = (
+        gdal.Open(str(next((tmp_path / name).glob("*_sharpened.tif")))).ReadAsArray().astype(float)
+        for name in ("plain", "out")
+    )
+    assert np.median(np.abs(second / scale / first - 1)) < 2e-3
 
 
 def test_different_scenes_are_refused(tmp_path: Path) -> None:

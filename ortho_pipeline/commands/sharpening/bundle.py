@@ -18,7 +18,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.heights.opening import gaps_masked
 from ortho_pipeline.commands.rectification import rectify
 from ortho_pipeline.commands.results import Result, to_store
-from ortho_pipeline.commands.sharpening.sharpen import require_one, require_several, sharpen
+from ortho_pipeline.commands.sharpening.sharpen import multispectral, panchromatic, sharpen
 from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError, OrthoError, completed
 from ortho_pipeline.errors.texts import Setting, Text
@@ -71,8 +71,8 @@ def rectify_bundle(
         As `rectify` and `sharpen`, and for an adjustment that the multispectral image cannot take over.
     """
     _refuse_options(pan, colours, scene, points)
-    require_one(colour_bands(RasterSource(pan, **scene.access)), pan)
-    require_several(colour_bands(RasterSource(colours, **scene.access)), colours)
+    panchromatic(RasterSource(pan, **scene.access))
+    multispectral(RasterSource(colours, **scene.access))
     opened = inputs.open_scene(colours, scene)
     _require_detail(inputs.open_scene(pan, scene), opened, scene, output)
     common: dict[str, Any] = {"surface": surface, "progress": progress, "command": command, "overwrite": overwrite}

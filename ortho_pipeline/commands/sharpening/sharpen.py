@@ -25,6 +25,7 @@ from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import states, together, write_json
 from ortho_pipeline.files.locations import Location, located, place
+from ortho_pipeline.files.shell import converted
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
@@ -169,9 +170,7 @@ class OrthoPair:
         """
         access = {**scene.access, "memory": output.memory}
         sharp, wide = RasterSource(pan, **access), RasterSource(colours, **access)
-        own, bands = colour_bands(sharp), colour_bands(wide)
-        require_one(own, pan)
-        require_several(bands, colours)
+        own, bands = panchromatic(sharp), multispectral(wide)
         grids = grid_of(pan, **scene.access), grid_of(colours, **scene.access)
         sources = RasterSource(pan, bands=own, **access), RasterSource(colours, bands=bands, **access)
         try:
@@ -218,25 +217,42 @@ class OrthoPair:
         return read_samples(pan, colours, self.bands, self.coarse, self.whole_ratio)
 
 
-def require_one(bands: Sequence[int], pan: str | os.PathLike[str]) -> None:
-    """Refuse a panchromatic image unless it has one band."""
+def panchromatic(source: RasterSource) -> tuple[int, ...]:
+    """Return the number of the band of a panchromatic image; refuse an image with another count."""
+    bands = colour_bands(source)
     if len(bands) != 1:
         raise InputError(
             f"this image has {counted(len(bands), 'band')}; a panchromatic image has one",
-            file=pan,
+            file=source.path,
             remedy="give the panchromatic image first, then the multispectral one",
         )
+    return _without_offset(source, bands)
 
 
-def require_several(bands: Sequence[int], colours: str | os.PathLike[str]) -> None:
-    """Refuse a multispectral image with one band."""
+def multispectral(source: RasterSource) -> tuple[int, ...]:
+    """Return the numbers of the bands of a multispectral image; refuse an image with one band."""
+    bands = colour_bands(source)
     if len(bands) < 2:
         raise InputError(
             f"this image has {counted(len(bands), 'band')}; a multispectral image has at least two",
-            file=colours,
+            file=source.path,
             remedy="combine single bands of the same acquisition first: `gdalbuildvrt -separate ms.vrt BLUE GREEN RED "
             "NIR`. If they have RPC files, copy one to ms_rpc.txt",
         )
+    return _without_offset(source, bands)
+
+
+def _without_offset(source: RasterSource, bands: tuple[int, ...]) -> tuple[int, ...]:
+    """Refuse bands whose value 0 is not the absence of light: pan-sharpening computes with ratios of values."""
+    if any(source.dataset.GetRasterBand(number).GetOffset() for number in bands):
+        raise InputError(
+            "the values of this image have an offset, so their ratios are not those of the light",
+            file=source.path,
+            field="offset",
+            remedy="apply scale and offset, and use the new file: "
+            f"`gdal_translate -unscale -ot Float32 {converted(source.path, 'unscaled')}`",
+        )
+    return bands
 
 
 def _own_ratio(grids: tuple[Grid, Grid]) -> float:
