@@ -3,7 +3,8 @@
 GDAL's weighted Brovey method multiplies the upsampled bands of each pixel by the panchromatic value over their weighted
 sum. GDAL knows one nodata value and no mask, computes in the type of the panchromatic band, and before 3.7 stretches
 the bands to its extent. So both rasters are cut to one extent first. Where a mask or another nodata value hides pixels,
-GDAL upsamples the bands in floating point, with a nodata value that no pixel has, and `brovey` computes as GDAL does.
+or the bands may be negative, GDAL upsamples them in floating point, with a nodata value that no pixel has, and `brovey`
+computes as GDAL does.
 Other grids are resampled once, by GDAL's warper.
 
 Source: Gillespie et al. 1987 (Brovey); GDAL, VRTPansharpenedDataset.
@@ -134,8 +135,10 @@ class Pansharpened:
         self._pan, self._colours, self._grids = pan, colours, grids
         self._weights, self._profile, self._threads, self._memory = weights, profile, threads, memory
         self._nodata, self._held = _common_nodata(pan, colours), list[gdal.Dataset]()
-        # GDAL would clamp the colours to the type of the panchromatic band.
-        self._native = bool(self.overlap.ratio) and pan.dtype == colours.dtype == profile.dtype
+        # GDAL would clamp the colours to the type of the panchromatic band, and divide by sums that negative colours
+        # make small.
+        alike = bool(self.overlap.ratio) and pan.dtype == colours.dtype == profile.dtype
+        self._native = alike and colours.dtype.kind == "u"
         bits = colours.bands[0].GetMetadataItem("NBITS", "IMAGE_STRUCTURE")
         self._largest = math.inf if bits is None else 2.0 ** int(bits) - 1
         whole, grid = self.overlap.whole, self.overlap.grid
@@ -249,7 +252,7 @@ class Pansharpened:
         return self._pan, self._colours
 
     def _floating(self, source: RasterSource, own: Grid, grid: Grid, resampling: str) -> gdal.Dataset:
-        wide = source.dtype.itemsize > 2 and source.dtype != np.float32
+        wide = source.dtype.kind == "i" or (source.dtype.itemsize > 2 and source.dtype != np.float32)
         more = {} if own.crs == grid.crs else {"srcSRS": own.crs.to_wkt(), "dstSRS": grid.crs.to_wkt()}
         if source.dtype.kind == "f" and source.validity != "nodata":
             more["srcNodata"] = "nan"
@@ -282,12 +285,12 @@ def brovey(pan: NDArray[Any], colours: NDArray[Any], weights: Sequence[float]) -
 
 
 def within(colours: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return upsampled bands within the range of their pixel type, as GDAL upsamples them.
+    """Return upsampled bands from 0 to the largest value of their pixel type, as GDAL upsamples unsigned ones.
 
-    Cubic convolution overshoots at edges. Negative values would make the weighted sum small and the quotient huge.
+    Cubic convolution overshoots at edges, and corrections of the atmosphere make dark water negative. Negative values
+    would make the weighted sum small and the quotient huge.
     """
-    limits = np.iinfo(dtype) if dtype.kind in "iu" else np.finfo(dtype)
-    return np.clip(colours, limits.min, limits.max)
+    return np.clip(colours, 0, (np.iinfo(dtype) if dtype.kind in "iu" else np.finfo(dtype)).max)
 
 
 def upsampled(colours: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float64]:

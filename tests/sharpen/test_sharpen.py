@@ -80,6 +80,31 @@ def test_pixels_are_those_of_gdal(bundle: Bundle, tmp_path: Path) -> None:
     np.testing.assert_allclose(pixels, expected, rtol=1e-6 if bundle.dtype == "float32" else 0)
 
 
+@pytest.mark.parametrize(("dtype", "scale"), [("int16", 1.0), ("float32", 1e-4)])
+def test_dark_water_with_negative_values_has_no_bright_pixels(dtype: str, scale: float, tmp_path: Path) -> None:
+    """A correction of the atmosphere leaves noise about 0 there; a quotient of it by a sum near 0 has no bound."""
+    bundle = Bundle(side=384, ratio=4)
+    truth = bundle.truth()
+    row, column = np.ogrid[:384, :384]
+    water = np.hypot(row - 192, column - 192) < 90
+    truth = np.where(water, np.random.default_rng(0).normal(0, 6, truth.shape), truth) * scale
+    wide = truth.reshape(4, 96, 4, 96, 4).mean(axis=(2, 4))
+    sharp = np.einsum("b,bij->ij", bundle.weights, truth)
+    pan, colours = write(tmp_path / "p.tif", sharp[None], 0.5, dtype), write(tmp_path / "m.tif", wide, 2.0, dtype)
+    pixels, valid, _ = pixels_of(pan, colours, bundle.weights)
+    assert valid.all()
+    # No band is larger than the panchromatic value by its weight, if no band is negative.
+    inner = np.hypot(row - 192, column - 192) < 80
+    assert np.abs(pixels[:, inner]).max() < np.abs(sharp[inner]).max() / min(bundle.weights) + scale
+    result = run("sharpen", pan, colours, "-o", tmp_path / "out", "--json")
+    assert result.exit_code == 0, result.output
+    quality = json.loads(result.stdout)["quality"]["sharpened"]["ergas"]
+    with np.errstate(invalid="ignore"):  # no spectrum where all bands are 0
+        assert errors(truth, pixels, 4)[0] < quality
+    below = write(tmp_path / "decibels.tif", wide - truth.max(), 2.0, dtype)
+    assert "most values of this ortho are negative" in refused(pan, below, "-o", tmp_path / "out")
+
+
 def test_pixels_with_one_nodata_value_are_those_of_gdal(tmp_path: Path) -> None:
     bundle = Bundle(side=384)
     sharp, wide = bundle.pixels()

@@ -107,6 +107,7 @@ def sharpen(
     stage = progress or (lambda name, share: None)
     stage("Weights", 0.0)
     samples = pair.samples()
+    _refuse_negative(samples, colours)
     regression = regress(samples, len(pair.bands))
     chosen = _given_weights(weights, pair) if weights is not None else regression.values
     stage("Registration", 0.0)
@@ -303,6 +304,17 @@ def _given_weights(weights: Sequence[float], pair: OrthoPair) -> tuple[float, ..
             "weights must not be negative, and one must be positive", field="weights", remedy="correct the weights"
         )
     return tuple(map(float, weights))
+
+
+def _refuse_negative(samples: Sequence[Sample], colours: str | os.PathLike[str]) -> None:
+    """Refuse bands that are mostly negative, which count as 0."""
+    values = np.concatenate([sample.colours[np.isfinite(sample.colours)] for sample in samples])
+    if np.count_nonzero(values < 0) > len(values) / 2:
+        raise InputError(
+            "most values of this ortho are negative, so they are no amounts of light",
+            file=colours,
+            remedy="give digital numbers, radiance or reflectance; not decibels",
+        )
 
 
 # -- registration ----------------------------------------------------------------------------------------------------
