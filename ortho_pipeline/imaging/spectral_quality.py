@@ -70,10 +70,14 @@ class QualitySums:
                     self._q.append(_q_index(truth[:, *block], other[:, *block]))
 
     def quality(self, ratio: float) -> SpectralQuality | None:
-        """Return the quality for so many panchromatic pixels along a multispectral one; None without pixels."""
-        if not self.pixels or not self._q or not self._angled or not (self._totals > 0).all():
+        """Return the quality for so many panchromatic pixels along a multispectral one; None without pixels.
+
+        Bands without light have no relative error.
+        """
+        light = self._totals > 0
+        if not self.pixels or not self._q or not self._angled or not light.any():
             return None
-        relative = self._squares / self.pixels / (self._totals / self.pixels) ** 2
+        relative = self._squares[light] / self.pixels / (self._totals[light] / self.pixels) ** 2
         ergas = 100.0 / ratio * math.sqrt(float(relative.mean()))
         return SpectralQuality(ergas, math.degrees(self._angles / self._angled), float(np.mean(self._q)))
 

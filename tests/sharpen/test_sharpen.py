@@ -209,6 +209,19 @@ def test_bright_objects_next_to_dark_ground_do_not_spoil_the_quality() -> None:
     assert quality["sharpened"]["ergas"] < 0.5 * quality["upsampled"]["ergas"]
 
 
+def test_a_band_without_light_does_not_hide_the_quality_of_the_others() -> None:
+    wide = np.random.default_rng(1).integers(40, 300, (3, 128, 128)).astype(np.float32)
+    empty = np.zeros((1, 128, 128), np.float32)
+    found = [
+        reduced_quality([Sample(wide.mean(axis=0), bands)], [1 / 3, 1 / 3, 1 / 3, 0.0][: len(bands)], 4, wide.dtype)
+        for bands in (wide, np.concatenate([wide, empty]))
+    ]
+    assert found[0] is not None
+    assert found[1] is not None
+    for name in ("ergas", "sam_deg"):
+        assert found[1]["sharpened"][name] == pytest.approx(found[0]["sharpened"][name])
+
+
 def test_weights_are_never_negative() -> None:
     random = np.random.default_rng(0)
     bands = random.uniform(100, 200, (3, 40, 40)).astype(np.float32)
