@@ -138,7 +138,7 @@ def _of_xmp(tags: Tags) -> _Source:
 
 def _of_exif(tags: Tags) -> _Source:
     """Return the position in EXIF; Pix4D's tags state its accuracy."""
-    lat, lon = _degrees(tags, "GPSLatitude", "S"), _degrees(tags, "GPSLongitude", "W")
+    lat, lon = _degrees(tags, "GPSLatitude", "NS"), _degrees(tags, "GPSLongitude", "EW")
     altitude = tags.number("GPSAltitude")
     if altitude is not None and _reference(tags) in _BELOW:
         altitude = -altitude
@@ -170,14 +170,20 @@ def _reference(tags: Tags) -> str:
     return tags.text("GPSAltitudeRef").lower().removeprefix("0x").lstrip("0")
 
 
-def _degrees(tags: Tags, name: str, negative: str) -> float | None:
+def _degrees(tags: Tags, name: str, directions: str) -> float | None:
+    """Return an angle; `directions` are the initials of the positive and of the negative one."""
     parts = tags.numbers(name)
     if parts is None:
         return None
     if not 1 <= len(parts) <= 3:
         raise tags.error(f"{len(parts)} numbers are not an angle", name)
     value = sum(part / 60**power for power, part in enumerate(parts))
-    return -value if tags.text(f"{name}Ref").upper().startswith(negative) else value
+    stated, wanted = tags.text(f"{name}Ref"), " or ".join(directions)
+    if not stated or stated[0].upper() not in directions:
+        # O is east in German, west in Spanish.
+        text = f"this tag must be {wanted}, but it is {stated[:20]!r}" if stated else "this tag is missing"
+        raise tags.error(text, f"{name}Ref", f"write {wanted} into this tag")
+    return -value if stated[0].upper() == directions[1] else value
 
 
 def _rounding(tags: Tags, name: str) -> float:

@@ -531,6 +531,8 @@ def test_pix4ds_focal_length_has_the_unit_that_is_stated(tmp_path, length, units
         ({**EXIF, "GPSLatitude": "(139) (0) (0)"}, DJI, "not on Earth"),
         ({**EXIF, "GPSLatitude": "(nan) (0) (0)"}, DJI, "'nan' is not a number"),
         ({**EXIF, "GPSLatitude": "(1) (2) (3) (4)"}, DJI, "4 numbers are not an angle"),
+        ({**EXIF, "GPSLongitudeRef": "Oeste"}, DJI, "must be E or W, but it is 'Oeste'"),
+        (without(EXIF, "LatitudeRef"), DJI, "GPSLatitudeRef: this tag is missing"),
         (without(EXIF, "Altitude"), without(DJI, "Altitude"), "no altitude"),
         (EXIF, {**DJI, "drone-dji:AbsoluteAltitude": "1e7"}, "is impossible"),
         (EXIF, without(DJI, "Gimbal"), "no camera angles"),
