@@ -36,19 +36,21 @@ def changes(seed: int, count: int = 6) -> np.ndarray:
 
 
 def test_changes_within_their_accuracies_are_not_told():
-    # One in 5,000 would be: two tests, each of one in 10,000.
+    # One in 3,300 would be: three tests, each of one in 10,000.
     assert sum(len(told(changes(seed))) for seed in range(300)) == 0
 
 
 def test_positions_or_angles_that_move_farther_are_told_with_both_sizes():
     factors = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
-    (one,) = told(changes(1) * factors)
-    assert (one.code, one.fields["what"], one.fields["count"]) == ("poses-contradicted", "positions", 6)
-    apart = (changes(1) * factors)[:, :3]
-    rms = np.sqrt(np.mean((apart - apart.mean(axis=0)) ** 2))
-    assert np.isclose(one.fields["rms"], rms)
-    assert np.isclose(one.fields["sigma"], np.sqrt(np.mean(ACCURACIES[:3] ** 2)))
-    assert "of 6 images" in str(one)
+    for one, axes, what in zip(
+        told(changes(1) * factors), ([0, 1], [2]), ("positions in plan", "heights"), strict=True
+    ):
+        assert (one.code, one.fields["what"], one.fields["count"]) == ("poses-contradicted", what, 6)
+        apart = (changes(1) * factors)[:, axes]
+        rms = np.sqrt(np.mean((apart - apart.mean(axis=0)) ** 2))
+        assert np.isclose(one.fields["rms"], rms)
+        assert np.isclose(one.fields["sigma"], np.sqrt(np.mean(ACCURACIES[axes] ** 2)))
+        assert f"{what} of 6 images" in str(one)
     (one,) = told(changes(1) * factors[::-1])
     assert (one.fields["what"], one.fields["unit"]) == ("angles", "°")
     assert np.isclose(one.fields["sigma"], np.degrees(0.05))
@@ -67,7 +69,16 @@ def test_accuracies_of_images_count_by_themselves():
     moved = changes(3)
     moved[3, :3] = [2.5, -1.5, 2.0]
     assert told(moved, sigmas) == []
-    assert [one.fields["what"] for one in told(moved)] == ["positions"]
+    assert [one.fields["what"] for one in told(moved)] == ["positions in plan", "heights"]
+
+
+def test_heights_of_an_unknown_datum_do_not_hide_the_accuracy_in_plan():
+    """Their 50 m would be named as the accuracy that a change of a metre contradicts."""
+    sigmas = np.array([0.02, 0.02, 50.0, 0.05, 0.05, 0.05])
+    (one,) = told(changes(1) * [50, 50, 1, 1, 1, 1], sigmas)
+    assert one.fields["what"] == "positions in plan"
+    assert one.fields["rms"] > 0.5
+    assert np.isclose(one.fields["sigma"], 0.02)
 
 
 def test_what_defines_a_datum_and_a_pose_alone_contradict_nothing():
@@ -75,12 +86,12 @@ def test_what_defines_a_datum_and_a_pose_alone_contradict_nothing():
     assert told(100 * changes(4, count=1)) == []
 
 
-@pytest.mark.parametrize(("part", "named"), [(0.985, []), (1.015, ["positions"])])
+@pytest.mark.parametrize(("part", "named"), [(0.985, []), (1.015, ["positions in plan"])])
 @pytest.mark.parametrize("images", [2, 5])
 def test_poses_contradict_at_a_chance_of_one_in_ten_thousand(images: int, part: float, named: list[str]) -> None:
-    """Along each of three axes, changes without their mean have a degree of freedom less than images."""
-    moved = np.random.default_rng(5).normal(0, 1, (images, 6)) * [1, 1, 1, 0, 0, 0]
+    """Along each of two axes, changes without their mean have a degree of freedom less than images."""
+    moved = np.random.default_rng(5).normal(0, 1, (images, 6)) * [1, 1, 0, 0, 0, 0]
     moved -= moved.mean(axis=0)
-    square = stats.chi2.isf(1e-4, 3 * (images - 1))
+    square = stats.chi2.isf(1e-4, 2 * (images - 1))
     moved *= part * np.sqrt(square / (moved**2).sum())
     assert [one.fields["what"] for one in told(moved * ACCURACIES)] == named

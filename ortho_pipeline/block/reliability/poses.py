@@ -22,7 +22,7 @@ _DEGREES = math.degrees(1.0)
 
 
 def contradicted_poses(fit: BlockFit, pseudo: Sequence[Pseudo]) -> list[Notice]:
-    """Return a notice for positions, and one for angles, that changed by more than their stated accuracies.
+    """Return a notice each for positions in plan, heights and angles that changed by more than their stated accuracies.
 
     Changes are counted without their mean of each axis. An error that all images share is one of the datum, or of the
     mount of the camera.
@@ -35,7 +35,11 @@ def contradicted_poses(fit: BlockFit, pseudo: Sequence[Pseudo]) -> list[Notice]:
     from scipy.special import chdtrc
 
     found = []
-    for what, names, size, unit in (("positions", EXTERIOR[:3], 1.0, "m"), ("angles", EXTERIOR[3:], _DEGREES, "°")):
+    for what, names, size, unit in (
+        ("positions in plan", EXTERIOR[:2], 1.0, "m"),
+        ("heights", EXTERIOR[2:3], 1.0, "m"),
+        ("angles", EXTERIOR[3:], _DEGREES, "°"),
+    ):
         changes, accuracies, freedom, images = np.zeros(0), np.zeros(0), 0, 0
         for name in names:
             moved, sigmas = changes_of(name, fit, pseudo)
