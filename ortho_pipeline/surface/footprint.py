@@ -27,7 +27,7 @@ from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 from ortho_pipeline.surface.flat import FlatSurface
-from ortho_pipeline.surface.rays import meet_surface
+from ortho_pipeline.surface.rays import meet_surface, refuse_camera_below
 
 #: Sample points per side of the image for the coverage by the DEM.
 _COVERAGE_SIDE = 33
@@ -212,6 +212,8 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
         bare, met, projects = _laid(model, surface, width, height)
         ring = bare.ring
     own = met.sum() / max(projects.sum(), 1)
+    if not own:
+        refuse_camera_below(model, surface, surface.provenance.get("path"))
     voids, area, sampled = _voids(model, surface, ring)
     # Use the finer of both samples; if a ray meets no height, the DEM does not cover all.
     fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)

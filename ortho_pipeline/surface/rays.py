@@ -14,8 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import CoverageError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import SensorModel, as_image
+from ortho_pipeline.models.correction import ImageCorrection
+from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
@@ -87,6 +90,29 @@ def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tole
         exact = _Ray(model, image[left], surface)
         ground[left] = _ground_at(model, image[left], _narrow(exact, *_bracket(exact, low, high), tolerance))
     return ground
+
+
+def refuse_camera_below(model: SensorModel, surface: Surface, file: str | None) -> None:
+    """Raise a `CoverageError` about a file if the camera of a frame is below the surface: its rays meet nothing."""
+    camera = model.model if isinstance(model, ImageCorrection) else model
+    if not isinstance(camera, FrameCamera):
+        return
+    above = float(surface.above(camera.perspective_centre[None], camera.crs)[0])
+    if above < 0:
+        raise CoverageError(
+            f"the camera is {-above:.0f} m below the ground by its altitude and these heights",
+            file=file,
+            field="vertical",
+            remedy=Text(
+                "state what the altitude is measured above (",
+                Setting("scene.sensor_options", "DATUM", key="vertical"),
+                "; for photos, above take-off: ",
+                Setting("scene.sensor_options", "METRES", key="takeoff"),
+                "), or check height datum (",
+                Setting("surface.vertical"),
+                ") and unit of the DEM",
+            ),
+        )
 
 
 def _ground_at(model: SensorModel, image: Array, height: Array) -> Array:

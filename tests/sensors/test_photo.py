@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ortho_photo import DATUM_SIGMA
+from osgeo import gdal
 from photos import DJI, EXIF, jpeg, photo
 
 from ortho_pipeline.cli.program import cli
@@ -605,6 +606,26 @@ def test_the_width_of_a_sensor_is_its_longer_side_also_in_portraits(tmp_path):
     size = {"PixelXDimension": "400", "PixelYDimension": "600"}
     for path in (photo(tmp_path / "a.tif"), photo(tmp_path / "b.tif", {**EXIF, **size}, size=(400, 600))):
         assert opened(path, sensor_width="13.2").facts["focal_length_px"] == pytest.approx(400, abs=1e-3)
+
+
+def test_an_altitude_above_takeoff_that_is_below_the_dem_asks_for_the_takeoff(tmp_path):
+    """The rays of such a camera meet nothing, so neither overlap nor place of the DEM is what is wrong."""
+    low = {**DJI, "drone-dji:AbsoluteAltitude": "+100.00"}
+    turned = {**low, "drone-dji:GimbalYawDegree": "+50.00"}
+    files = [str(photo(tmp_path / f"{name}.tif", EXIF, xmp)) for name, xmp in (("a", low), ("b", turned))]
+    dem = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "dem.tif"), 200, 200, 1, gdal.GDT_Float32)
+    dem.SetGeoTransform((33.25, 1e-4, 0, 39.51, 0, -1e-4))
+    dem.SetProjection("EPSG:4326")
+    dem.GetRasterBand(1).Fill(900.0)
+    dem = None
+    words = ["--dem", str(tmp_path / "dem.tif"), "--dem-vertical", "ellipsoid", "-o", str(tmp_path / "out")]
+    for command in (["rectify", files[0]], ["adjust", *files, "--ties", "auto"]):
+        done = CliRunner().invoke(cli, [*command, *words])
+        assert done.exit_code == 2
+        assert "the camera is 800 m below the ground" in done.output
+        assert "--sensor-option takeoff=METRES" in done.output
+    done = CliRunner().invoke(cli, ["rectify", files[0], *words, "--sensor-option", "takeoff=900"])
+    assert done.exit_code == 0, done.output
 
 
 def test_photos_that_do_not_overlap_are_an_error(tmp_path):

@@ -23,6 +23,7 @@ from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, SceneVi
 from ortho_pipeline.imaging.ties.pairs import Pair, PairMatches, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.caching.block_cache import limit_cache
+from ortho_pipeline.surface.rays import refuse_camera_below
 
 #: Largest ratio of the number of cells of a scene to the number of points wanted in its smallest overlap.
 _MOST = 10
@@ -77,6 +78,8 @@ def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
     targets = [OtherScene(view.intensity, view.model) for view in views]
     overlaps = _overlaps(views, targets)
     if not overlaps:
+        for view in views:
+            refuse_camera_below(view.model, view.surface, view.intensity.source.path)
         raise InputError(
             "no two of these images overlap: "
             + ", ".join(os.path.basename(view.intensity.source.path) for view in views[:_NAMED])
