@@ -99,7 +99,7 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
     ------
     InputError
         If nothing tells the focal length in pixels, tags contradict each other, the lens is a fisheye, or the photo is
-        a crop.
+        a crop or a panorama.
     """
     full, full_rows = _full_size(tags, width, height)
     if tags.text("Camera:ModelType").lower() == "fisheye":
@@ -107,6 +107,12 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
             "the lens is a fisheye, which the model of frames cannot represent",
             "Camera:ModelType",
             "make undistorted photos with OpenDroneMap or Pix4D, and use these",
+        )
+    if projection := tags.text("GPano:ProjectionType"):
+        raise tags.error(
+            f"this image is a panorama ({projection}) of several photos",
+            "GPano:ProjectionType",
+            "leave it out, and give the photos",
         )
     focal = tags.positive("FocalLength")
     if sensor_width is not None:

@@ -23,6 +23,7 @@ PREFIXES = {
     "http://pix4d.com/camera": "Camera",
     "http://ns.sensefly.com/Camera": "senseFly",
     "http://ns.adobe.com/tiff": "tiff",
+    "http://ns.google.com/photos/1.0/panorama": "GPano",
 }
 REMEDY = "copy the photo again from the camera, or give a camera file and a table of poses (docs/formats/frame.md)"
 _VERSION = re.compile(r"/(\d+\.\d+)?/?$")

@@ -14,6 +14,7 @@ SPACES = {
     "Camera": "http://pix4d.com/camera/1.0",
     "senseFly": "http://ns.sensefly.com/Camera/1.0/",
     "DLS": "http://micasense.com/DLS/1.0/",
+    "GPano": "http://ns.google.com/photos/1.0/panorama/",
 }
 EXIF = {
     "Make": "DJI",

@@ -541,6 +541,7 @@ def test_pix4ds_focal_length_has_the_unit_that_is_stated(tmp_path, length, units
         (EXIF, {**DJI, "drone-dji:GimbalYawDegree": "0", "drone-dji:GimbalPitchDegree": "0"}, "does not record them"),
         (EXIF, {**DJI, "drone-dji:GimbalPitchDegree": "20"}, "does not look at the ground"),
         (EXIF, {**DJI, "Camera:ModelType": "fisheye"}, "a fisheye"),
+        (EXIF, {**DJI, "GPano:ProjectionType": "equirectangular"}, r"a panorama \(equirectangular\)"),
         ({**EXIF, "PixelXDimension": "1200"}, DJI, "crops are not supported|by its tags"),
         ({**without(EXIF, "35mm"), "Model": "X"}, DJI, r"sensor of this camera \(X\) is not known"),
         (EXIF, {**DJI, "drone-dji:DewarpData": "x;1,2,3"}, "3 numbers instead of 9"),
