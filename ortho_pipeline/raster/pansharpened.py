@@ -139,6 +139,8 @@ class Pansharpened:
         # make small.
         alike = bool(self.overlap.ratio) and pan.dtype == colours.dtype == profile.dtype
         self._native = alike and colours.dtype.kind == "u"
+        #: Side (px) of the windows to read: those in floating point take several times the memory.
+        self.window = 1024 if self._native else 512
         bits = colours.bands[0].GetMetadataItem("NBITS", "IMAGE_STRUCTURE")
         self._largest = math.inf if bits is None else 2.0 ** int(bits) - 1
         whole, grid = self.overlap.whole, self.overlap.grid

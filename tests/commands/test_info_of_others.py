@@ -122,7 +122,12 @@ def test_a_table_that_names_the_image_is_named(tmp_path):
 
 
 def test_a_photo_with_a_position_says_what_is_missing(tmp_path):
-    tags = {"EXIF_GPSLatitude": "(24) (41) (5.7)", "EXIF_Make": "DJI", "EXIF_Model": "FC6310R"}
+    tags = {
+        "EXIF_GPSLatitude": "(24) (41) (5.7)",
+        "EXIF_GPSLatitudeRef": "N",
+        "EXIF_Make": "DJI",
+        "EXIF_Model": "FC6310R",
+    }
     done = info(picture(tmp_path / "a.tif", tags), "--json")
     assert done.exit_code == 2
     assert "this photo has no position" in json.loads(done.stdout)["error"]["message"]

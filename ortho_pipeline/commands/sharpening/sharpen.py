@@ -37,8 +37,6 @@ from ortho_pipeline.raster.valid_area import doubtful_alpha
 from ortho_pipeline.runtime.process_limits import Progress, one_blas_thread
 
 SCHEMA_VERSION = 1
-#: Side (px) of the windows in which the ortho is written.
-_WINDOW = 1024
 #: Least ratio of pixel sizes: below it there is no detail to add.
 _LEAST_RATIO = 1.2
 #: Share of the panchromatic variance that multispectral bands of the same scene explain at least.
@@ -374,10 +372,10 @@ def _write(pair: OrthoPair, weights: Sequence[float], path: Path, stage: Progres
     grid, valid_pixels = image.overlap.grid, 0
     options: dict[str, Any] = {"driver": output.format, "creation_options": output.creation_options}
     with RasterWriter(path, grid, profile, threads=threads, progress=stage, **options) as writer:
-        for top in range(0, grid.height, _WINDOW):
+        for top in range(0, grid.height, image.window):
             stage("Sharpening", top / grid.height)
-            for left in range(0, grid.width, _WINDOW):
-                size = min(_WINDOW, grid.width - left), min(_WINDOW, grid.height - top)
+            for left in range(0, grid.width, image.window):
+                size = min(image.window, grid.width - left), min(image.window, grid.height - top)
                 pixels, valid = image.read(left, top, *size)
                 valid_pixels += int(np.count_nonzero(valid))
                 writer.write(left, top, pixels, valid)
