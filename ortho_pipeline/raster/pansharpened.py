@@ -177,7 +177,7 @@ class Pansharpened:
         colours = colours[: self._colours.count, *inset][:, :height, :width]
         valid = (pan != _EMPTY) & (colours != _EMPTY).all(axis=0)
         colours = within(colours, self._colours.dtype)
-        if self._native and colours.dtype != self._colours.dtype:
+        if self._native:
             # As GDAL does in windows without empty pixels, so that there are no seams between both.
             colours = np.floor(colours + 0.5)
         return brovey(pan, colours, self._weights), valid
@@ -345,20 +345,20 @@ def _virtual(
 
 
 def _common_nodata(pan: RasterSource, colours: RasterSource) -> float | None:
-    """Return the nodata value 0 of all bands, if nothing else hides pixels; else None.
+    """Return the nodata value 0 of all bands, if nothing else hides pixels of unsigned values; else None.
 
     With any other value, GDAL would also empty valid pixels whose weighted sum is 0.
     """
     values = {*pan.nodata, *colours.nodata}
     flags = {source.bands[0].GetMaskFlags() for source in (pan, colours)}
-    if values != {0.0} or flags != {gdal.GMF_NODATA} or "f" in (pan.dtype.kind, colours.dtype.kind):
+    if values != {0.0} or flags != {gdal.GMF_NODATA}:
         return None
     return values.pop()
 
 
 def _whole(source: RasterSource, left: int, top: int, width: int, height: int) -> bool:
-    """Return whether all pixels of a window are valid."""
-    if source.validity == "all" and source.dtype.kind != "f":
+    """Return whether all pixels of a window of unsigned values are valid."""
+    if source.validity == "all":
         return True
     return source.read_valid(left, top, source.read(left, top, width, height)) is None
 
